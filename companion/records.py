@@ -382,7 +382,8 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     worse horizontal axis (m/s), gusts included. `horizon_s` is the time since the last accepted fix.
     `disagreement` is the greatest distance between the running estimators (m). `protection` is the horizontal
     protection level (m): the error exceeds it with the configured risk, even if any one source is faulty.
-    `false_sources`: once a second, the probability that each source is false, by name.
+    `false_sources`: once a second, the probability that each source is false, by name. `contradicted`: by a
+    first GNSS, where it began at one beacon. `restarts`: how often the position was given up.
     """
 
     mode: Mode
@@ -408,6 +409,8 @@ class Solution(Stamped, frozen=True, gc=False, tag=True):
     witness: bool = False
     false_sources: tuple[tuple[str, float], ...] = ()
     bounds: Bounds | None = None
+    contradicted: bool = False
+    restarts: int = 0
     parallel: tuple[ParallelEstimate, ...] = ()
 
     @property

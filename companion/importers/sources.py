@@ -259,7 +259,9 @@ def _check_autopilot(log: tlog.Tlog, wanted: int, path: Path) -> None:
             systems.add(entry.frame.system)
     has = " and ".join(map(str, sorted(systems)))
     if has:
-        raise LogError(f"{path}: no autopilot {wanted}, but {has}: set link.system_id, or leave it out")
+        raise LogError(
+            f"{path}: it has no autopilot {wanted}; it has {has}: set link.system_id, or leave it out"
+        )
 
 
 def open_source(

@@ -41,10 +41,10 @@ class BeaconAnswers:
 
     def refusal(self, receiver: Hashable, source: str, now_ns: int) -> str | None:
         """Return why an answer of a source ("beacon 7", "star 2") is not used, None if it is."""
-        if not self._limiter.take(receiver, now_ns):
-            return RATE_REASON
         if not self._has_turn(receiver, source, now_ns):
             return TURN_REASON
+        if not self._limiter.take(receiver, now_ns):
+            return RATE_REASON
         if self.followed(source, now_ns) not in (None, receiver):
             return f"{source} is received by another receiver"
         if source not in self._followed:  # bounded by the rate of new ones

@@ -26,7 +26,6 @@ from companion.navigator.progress import (
 from companion.navigator.state import (
     EXCLUDED,
     FIXES,
-    REFUSED_NS,
     Beacon,
     Contradiction,
     Pending,
@@ -40,7 +39,6 @@ from companion.navigator.state import (
     gnss_is_believed,
     held_s,
     hypotheses,
-    is_contradicted,
     is_jammed,
     source_name,
     sources,
@@ -57,6 +55,7 @@ from companion.records import (
     Stamped,
     Vector2,
 )
+from companion.units import SECOND_NS
 
 GATE_SIGMA = 5.0
 MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
@@ -65,6 +64,7 @@ JUMPED_M = GATE_SIGMA * CHANNEL_JUMP_M  # within it a jump of the channel explai
 BEACON_FIRST_M = 10_000.0
 #: At twice as much a beacon that is elsewhere is less likely than an outlier of GNSS: the bank blamed GNSS.
 BEACON_REACH_M = 6000.0
+REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 
 
 def gnss(state: State, record: Gnss, settings: Settings) -> Step:
@@ -307,13 +307,15 @@ def _left_for_gnss(state: State, record: Gnss, settings: Settings) -> Step:
 
     A beacon that is not where it states is likelier than a GNSS that is false from its first fix on.
     """
-    apart = _apart(state, record, settings)
-    before = is_contradicted(state, record.t_ns, settings)
-    since_ns = before.since_ns if before else record.t_ns
-    if record.t_ns - since_ns < REFUSED_NS or is_jammed(state):
+    apart, before = _apart(state, record, settings), state.contradiction
+    if before is None or record.t_ns - before.last_ns > REFUSED_NS or is_jammed(state):
+        since_ns = record.t_ns
+    else:
+        since_ns = before.since_ns
+    if record.t_ns - since_ns < REFUSED_NS:
         label, why = f"gnss {record.receiver}", "contradicts a position that began at a beacon, m"
         out: list[Output] = [Rejection(record.t_ns, record.rx_ns, label, why, apart, BEACON_REACH_M)]
-        if before is None:
+        if since_ns == record.t_ns and not is_jammed(state):
             text = f"{label} is {apart:.0f} m off the beacon's position: one of them is wrong"
             out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
         now = Contradiction(since_ns, record.t_ns, apart)

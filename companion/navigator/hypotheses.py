@@ -3,7 +3,7 @@
 Base states are those of the channel, then the biases of each beacon, by identity: of its azimuth, of its
 range, and of the time of its answers. GNSS, airspeed and each beacon have a group of lie states, so that all
 of them may be false at once. Of GNSS either the position, with its velocity or alone, or the velocity alone
-is false; of a beacon its azimuth, its range, or both by its place.
+is false; of a beacon its azimuth, its range, each by itself, or both by its place.
 """
 
 from __future__ import annotations

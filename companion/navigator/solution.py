@@ -38,7 +38,6 @@ from companion.navigator.state import (
     held_s,
     hypotheses,
     is_contradicted,
-    is_jammed,
     levelled,
     source_name,
     sources,
@@ -76,10 +75,8 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     point = levelled(nominal.point, state)
     t_ns = point.t_ns
     rests_on = sources(state, t_ns, settings)
-    against = None if is_jammed(state) else is_contradicted(state, t_ns, settings)
-    # neither the beacon nor a bound that rests on it holds while GNSS contradicts it
-    fixes = Source(0) if against else rests_on & FIXES
-    promised = None if against else bounded_trajectory.guaranteed(state, point)
+    fixes, against = rests_on & FIXES, is_contradicted(state, t_ns, settings)
+    promised = None if against else bounded_trajectory.guaranteed(state, point)  # it rests on the beacon
     leading = estimate(state, settings)
     state = structs.replace(state, leading=(bank, leading))
     candidates = _candidates(state, leading, nominal.pending_s, promised, settings)
@@ -99,7 +96,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     protection += against.apart_m if against else 0.0
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
-    suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY])
+    suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY]) or bool(against)
     held = _trust(state.held, trust.Evidence(bool(fixes), suspicion, protection), t_ns, config)
     north, east, down = point.v_n
     lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
@@ -110,7 +107,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     solution = Solution(
         t_ns=t_ns,
         rx_ns=rx_ns,
-        mode=Mode.UNTRUSTED if against else _mode(bool(fixes), bound_n, protection, settings),
+        mode=_mode(bool(fixes), bound_n, protection, settings),
         estimator=leads,
         lat=lat,
         lon=lon,
@@ -136,10 +133,12 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         sigma_velocity=math.hypot(math.sqrt(velocity_variance), settings.model.channel.velocity_noise),
         protection=protection,
         trust=held.trust,
-        gnss_false=_gnss_false(state),
+        gnss_false=max(_gnss_false(state) or 0.0, known.settings.believed) if against else _gnss_false(state),
         witness=witness,
         false_sources=false_sources,
         bounds=promised.bounds if promised else None,
+        contradicted=against is not None,
+        restarts=state.restarts,
         parallel=tuple(
             ParallelEstimate(name, c.error_n, c.covariance)
             for name in config.estimator.parallel

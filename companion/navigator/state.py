@@ -30,7 +30,6 @@ from companion.units import SECOND_NS
 
 FIXES = Source.GNSS | Source.AZIMUTH | Source.RANGE
 JAMMED_NS = 10 * SECOND_NS  # the receiver's word lasts so long
-REFUSED_NS = 10 * SECOND_NS  # fixes that no hypothesis takes begin the position again after so long at least
 SUSPECT, EXCLUDED = 1, 2
 NEAR_S = 0.5  # the bank is at most so far behind: in between the error moves by its velocity
 
@@ -106,6 +105,7 @@ class State(Struct, frozen=True):
     leading: tuple[Bank, Gaussian] | None = None  # moments of the leading family, and of which bank
     protection: tuple[int, float, float, float] | None = None  # when computed; radius, position error (m)
     fixed: bool = False  # whether a fix was ever used
+    restarts: int = 0  # how often the position was given up
     beacons: tuple[Beacon, ...] = ()
     unfit: tuple[tuple[int, int], ...] = ()  # beacons none of whose answers fits: identity, answers so far
     jammed_ns: int | None = None  # when the receiver last reported jamming or spoofing
@@ -140,7 +140,13 @@ Step = tuple[State, list[Output]]
 
 def afresh(state: State) -> State:
     """What is left of a state where the estimate begins again."""
-    return State(next_ns=state.next_ns, origin=state.origin, sensors=state.sensors, level=state.level)
+    return State(
+        next_ns=state.next_ns,
+        origin=state.origin,
+        sensors=state.sensors,
+        level=state.level,
+        restarts=state.restarts + 1,
+    )
 
 
 def with_sensors(state: State, **changes: Any) -> State:
@@ -181,12 +187,11 @@ def is_jammed(state: State) -> bool:
 
 
 def is_contradicted(state: State, t_ns: int, settings: Settings) -> Contradiction | None:
-    """The contradiction of a first GNSS that is still received; None if there is none."""
-    found = state.contradiction
-    if found is None or state.gnss_taken is not None:
+    """The contradiction of a first GNSS that is still received and not jammed; None if there is none."""
+    found, timeout_ns = state.contradiction, round(1e9 * settings.config.gnss.timeout_s)
+    if found is None or state.gnss_taken is not None or t_ns - found.last_ns > timeout_ns or is_jammed(state):
         return None
-    received_ns = max(REFUSED_NS, round(1e9 * settings.config.gnss.timeout_s))
-    return found if t_ns - found.last_ns <= received_ns else None
+    return found
 
 
 def gnss_climb(state: State, t_ns: int) -> float:

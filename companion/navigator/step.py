@@ -82,7 +82,9 @@ def _reboot(state: State, record: Reboot, settings: Settings) -> Step:
         sensors = Sensors(steady_m_s=state.sensors.steady_m_s)
         state = structs.replace(state, sensors=sensors, gnss_fix=None, local=None)
         return state, [Reset(record.t_ns, record.rx_ns, "sensors", why)]
-    return State(next_ns=state.next_ns), [Reset(record.t_ns, record.rx_ns, "navigator", why)]
+    return State(next_ns=state.next_ns, restarts=state.restarts + 1), [
+        Reset(record.t_ns, record.rx_ns, "navigator", why)
+    ]
 
 
 def _time_step(state: State, record: TimeStep, settings: Settings) -> Step:

@@ -35,7 +35,6 @@ from companion.records import (
     FilterStatus,
     GlobalPosition,
     Gnss,
-    Reset,
     RsbnFix,
     Solution,
     Stamped,
@@ -44,9 +43,6 @@ from companion.records import (
 from companion.units import SECOND_NS
 
 DISPLAY_NAMES = {RESET: "external position"}
-OUT_OF_DRIFT = "the autopilot cannot have drifted there since its last GPS fix"
-"""Soon after GNSS was lost the autopilot's own position is better than one so far off: that of a beacon at a
-wrong place took an ArduPlane 22 km off."""
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
 """A reset is no series of measurements; a receiver's accuracy is judged by limits of its own."""
 
@@ -81,7 +77,7 @@ class AutopilotOutput:
         self.config, self._receivers = config, self._receivers.tuned(config)
 
     def receive(self, record: Stamped) -> None:
-        """Process a record from the autopilot or a beacon, or a reset of the navigator."""
+        """Process a record from the autopilot or a beacon."""
         if isinstance(record, SystemTime):
             if record.unix_ns is not None:
                 self.unix_ns = record.unix_ns - record.t_ns
@@ -98,8 +94,6 @@ class AutopilotOutput:
             self._source_switch.receive(
                 structs.replace(record, sigma_azimuth=sigma_azimuth, sigma_range=sigma_range)
             )
-        elif isinstance(record, Reset) and record.what == "position":
-            self._gate.begin_again()
 
     def handle_reboot(self) -> None:
         """Reset what was known of the autopilot; it has rebooted."""
@@ -141,6 +135,8 @@ class AutopilotOutput:
                     if reason is None:
                         encoded[name] = message
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
+        if isinstance(position, Position) and not encoded:
+            self._gate.retract()
         switched = PROFILES[self.config.output.profile].switched
         if by_set := switched.intersection(names):
             hz = max(self.config.output.rates_hz[name] for name in switched)
@@ -189,9 +185,8 @@ class AutopilotOutput:
         output = self.config.output
         if not output.fits(receiver.autopilot):
             return f"the autopilot is not {output.profile}: set output.profile"
-        is_undoubted = (solution.gnss_false or 0.0) < BELIEVED  # the last fix, from which it drifts
-        if is_undoubted and self._position_reset.is_out_of_drift(position):
-            return OUT_OF_DRIFT
+        if solution.contradicted and not self._source_switch.is_on_companion:
+            return "GNSS contradicts it"  # an autopilot that rests on it goes on so until it is decided
         return self._position_reset.withholding_reason(position) if name == RESET else None
 
     def _add_event(self, event: Event | None) -> None:

@@ -1,7 +1,7 @@
 """Output gate: checks every solution before it may steer the autopilot. No messages, no clock.
 
 A solution passes if it is trusted, finite, recent, within the range of an aircraft and consistent with the
-last one that passed. Ages are computed from the times of the solution.
+last one that was sent. Ages are computed from the times of the solution.
 
 Trust is checked besides the mode: at the first fix after an outage the mode is already fixed, while trust
 returns only after `integrity.settle_s`. A degraded solution passes with the sigma of its estimator: a faulty
@@ -23,8 +23,8 @@ each a reset: a reset changes the position only, while a slope would be taken fo
 the autopilot's own position, as its filter lags behind ours. What is left of the jump is stated in the
 covariance.
 
-Where the navigator has given up its position, the next solution is compared with none, and goes out whole:
-in steps of 10 m a jump of 20 km would take minutes, in which the old position steers.
+Where the navigator has given up its position since, the next solution is compared with none, counts as a
+reset and goes out whole: in steps of 10 m a jump of 20 km would take minutes, in which the old one steers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from typing import NamedTuple
 from companion.estimate.bank.settings import DEFAULT
 from companion.link.dialect import Message
 from companion.nav.geometry import Geodetic, displace, separation, wrap_angle
-from companion.records import Event, Mode, Severity, Solution, Trust, Vector3
+from companion.records import Event, Mode, Severity, Solution, Trust, Vector2, Vector3
 from companion.units import SECOND_NS
 
 MAX_AGE_S = 1.0
@@ -132,18 +132,25 @@ def withholding_reason(solution: Solution) -> str | None:
     return None
 
 
+class _Passed(NamedTuple):
+    """What the gate remembers of the solutions that passed."""
+
+    last: Position | None = None
+    is_gnss_false: bool = False  # as the last one passed
+    restarts: int = 0  # of the navigator's position
+    resets: int = 0
+    left_n: Vector2 = (0.0, 0.0)  # from the solution to the position that goes out, m north, east
+
+
 class Gate:
-    """Gate for successive solutions; stores the last one that passed.
+    """Gate for successive solutions; stores the last one that passed, unless it was not sent.
 
     A jump that is counted goes out in steps of `max_step_m` at most.
     """
 
     def __init__(self, max_step_m: float = math.inf) -> None:
-        self._last: Position | None = None
-        self._is_gnss_false = False  # as the last one passed
-        self._resets = 0
         self._max_step_m = max_step_m
-        self._left_n = (0.0, 0.0)  # from the solution to the position that goes out, m north, east
+        self._passed = self._before = _Passed()  # up to the last one, and up to the one before it
 
     def admit(self, solution: Solution, own: Geodetic | None = None) -> Position | str:
         """Return the position to be sent for `solution`, or the reason why it is withheld.
@@ -165,49 +172,52 @@ class Gate:
             s.sigma_velocity,
         ).at(s.rx_ns)
         is_false = (s.gnss_false or 0.0) > DEFAULT.excluded
-        if self._last is not None:
-            if here.t_ns < self._last.t_ns:
+        last, left_n, resets = self._passed.last, self._passed.left_n, self._passed.resets
+        if last is not None and s.restarts != self._passed.restarts:
+            left_n, resets = (0.0, 0.0), resets + 1
+        elif last is not None:
+            if here.t_ns < last.t_ns:
                 return "timestamp before the previous position"
-            dt = (here.t_ns - self._last.t_ns) * 1e-9
-            moved_n = _jump(self._last, here, dt)
+            dt = (here.t_ns - last.t_ns) * 1e-9
+            moved_n = _jump(last, here, dt)
             jump = math.hypot(*moved_n)
             room = JUMP_MARGIN_M + 0.5 * MANOEUVRE * dt * dt
-            is_explained = is_false and not self._is_gnss_false
-            if jump > SIGMAS * (self._last.sigma + here.sigma) + room and not is_explained:
+            is_explained = is_false and not self._passed.is_gnss_false
+            if jump > SIGMAS * (last.sigma + here.sigma) + room and not is_explained:
                 return "jump larger than its accuracy justifies"
             if jump > SIGMAS * here.sigma + room:
-                self._left_n = self._left_n[0] - moved_n[0], self._left_n[1] - moved_n[1]
+                left_n = left_n[0] - moved_n[0], left_n[1] - moved_n[1]
                 if own is not None:
-                    self._begin_at(own, here, SIGMAS * self._last.sigma + room)
-        self._last, self._is_gnss_false = here, is_false
+                    left_n = _begin_at(own, here, left_n, SIGMAS * last.sigma + room)
+        self._before, self._passed = self._passed, _Passed(here, is_false, s.restarts, resets, left_n)
         return self._stepped(here)
 
-    def begin_again(self) -> None:
-        """Compare the next solution with none: the navigator has given up the position of those before."""
-        if self._last is not None:
-            self._last, self._left_n, self._resets = None, (0.0, 0.0), self._resets + 1
-
-    def _begin_at(self, own: Geodetic, here: Position, near: float) -> None:
-        """Begin the steps at the autopilot's own position, if it is within `near` of the last one sent, m."""
-        north, east, _ = separation(own, here.place)
-        if math.hypot(north - self._left_n[0], east - self._left_n[1]) <= near:
-            self._left_n = north, east
+    def retract(self) -> None:
+        """Forget the last solution that passed: it was not sent, so the autopilot cannot compare with it."""
+        self._passed = self._before
 
     def _stepped(self, here: Position) -> Position:
         """Return the position that goes out for `here`: a step nearer to it, if a jump is not over."""
-        left = math.hypot(*self._left_n)
+        left = math.hypot(*self._passed.left_n)
         if left == 0.0:
-            return here._replace(resets=self._resets)
-        self._resets += 1
+            return here._replace(resets=self._passed.resets)
         share = max(0.0, 1.0 - self._max_step_m / left)
-        self._left_n = north, east = share * self._left_n[0], share * self._left_n[1]
+        north, east = share * self._passed.left_n[0], share * self._passed.left_n[1]
+        self._passed = self._passed._replace(resets=self._passed.resets + 1, left_n=(north, east))
         lat, lon, _ = displace(*here.place, north, east, 0.0)
         nn, ne, ee = here.covariance
         covariance = nn + north * north, ne + north * east, ee + east * east
-        return here._replace(lat=lat, lon=lon, covariance=covariance, resets=self._resets)
+        return here._replace(lat=lat, lon=lon, covariance=covariance, resets=self._passed.resets)
 
 
-def _jump(last: Position, here: Position, dt: float) -> tuple[float, float]:
+def _begin_at(own: Geodetic, here: Position, left_n: Vector2, near: float) -> Vector2:
+    """Return where the steps begin: the autopilot's own position if within `near` of the last one sent, m."""
+    north, east, _ = separation(own, here.place)
+    is_near = math.hypot(north - left_n[0], east - left_n[1]) <= near
+    return (north, east) if is_near else left_n
+
+
+def _jump(last: Position, here: Position, dt: float) -> Vector2:
     """Return `here` from the last position propagated by the mean velocity, m north, east."""
     (v_n, v_e, _), (w_n, w_e, _) = last.v_n, here.v_n
     north, east, _ = separation(here.place, last.place)

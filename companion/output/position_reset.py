@@ -9,8 +9,6 @@ sigmas indicates a fault of ours: the reset is withheld.
 
 from __future__ import annotations
 
-import math
-
 from companion.link.dialect import entry_name, mavlink
 from companion.nav.geometry import Geodetic, displace
 from companion.output.gate import JUMP_MARGIN_M, SIGMAS, Position, distance
@@ -55,38 +53,18 @@ class PositionReset:
 
     def withholding_reason(self, position: Position) -> str | None:
         """Return why `position` must not be sent now; None if it may be sent."""
+        now, there = position.t_ns, self.autopilot_place(position.t_ns)
         if not self._has_receiver:
             return "no GPS message received yet, so the autopilot may have a fix"
-        if self._has_gps(position.t_ns):
+        if self._fixed_ns is not None and now - self._fixed_ns < GPS_TIMEOUT_NS:
             return "the autopilot has GPS"
-        away = self._beyond_drift(position, WIND_ERROR)
-        if away is None:
-            return "no recent position received from the autopilot"
-        return "further from the autopilot's position than its possible drift" if away > 0.0 else None
-
-    def is_out_of_drift(self, position: Position) -> bool:
-        """Return whether an autopilot without GPS cannot have drifted to `position` since its last fix.
-
-        One without airspeed may hold its last position: its whole speed is drift then.
-        """
-        if self._has_gps(position.t_ns):
-            return False
-        away = self._beyond_drift(position, WIND_ERROR + math.hypot(*position.v_n[:2]))
-        return away is not None and away > 0.0
-
-    def _has_gps(self, now_ns: int) -> bool:
-        return self._fixed_ns is not None and now_ns - self._fixed_ns < GPS_TIMEOUT_NS
-
-    def _beyond_drift(self, position: Position, drift_m_s: float) -> float | None:
-        """Return how much farther off the autopilot `position` is than drift and our sigmas explain, m.
-
-        Negative where they explain it; None without a recent position of the autopilot.
-        """
-        there = self.autopilot_place(position.t_ns)
         if there is None or self._correct_ns is None:
-            return None
-        drift = drift_m_s * (position.t_ns - self._correct_ns) * 1e-9
-        return distance(there, position.place) - SIGMAS * position.sigma - drift - JUMP_MARGIN_M
+            return "no recent position received from the autopilot"
+        drift = WIND_ERROR * (now - self._correct_ns) * 1e-9
+        away = distance(there, position.place)
+        if away > SIGMAS * position.sigma + drift + JUMP_MARGIN_M:
+            return "further from the autopilot's position than its possible drift"
+        return None
 
     def handle_acknowledgement(self, result: int, now_ns: int) -> Event | None:
         """Process the result of a reset; return an event if it differs from the previous result."""

@@ -506,10 +506,8 @@ class CompanionCore:
         for output in self._navigator.handle(record):
             if isinstance(output, Solution):
                 self._send(output, early=isinstance(record, RsbnFix))
-            elif isinstance(output, Reset):
-                self._output.receive(output)
-                if isinstance(record, LocalPosition):
-                    self._origin.forget()  # it may have moved: do not use it until received again
+            elif isinstance(output, Reset) and isinstance(record, LocalPosition):
+                self._origin.forget()  # it may have moved: do not use it until received again
             # a late record folded again in this call is not this sender's
             is_rejected |= isinstance(output, Rejection) and output.rx_ns == record.rx_ns
             self._emit(output)

@@ -135,6 +135,8 @@ FIELDS = {
     "what": "what was reset",
     "widening": "factor of the bounds by residuals beyond the stated errors, 1 if none",
     "witness": "whether a beacon confirms the solution",
+    "contradicted": "whether a first GNSS contradicts the beacon at which the position began",
+    "restarts": "how often the position was given up and begun again",
     "x_n": "m from the local origin: north, east, down",
 }  # fmt: skip
 

@@ -323,7 +323,7 @@ def test_log_without_the_autopilot_states_so(tmp_path: pathlib.Path) -> None:
 def test_a_log_of_another_autopilot_than_the_configured_one_names_those_it_has() -> None:
     """The report stated that the log had nothing for an inertial channel."""
     path = DATA / "dronekit_copter_cut.tlog"
-    with pytest.raises(LogError, match=f"{path.name}: no autopilot 9, but 1: set link.system_id"):
+    with pytest.raises(LogError, match=f"{path.name}: it has no autopilot 9; it has 1: set link.system_id"):
         list(sources.open_source(path, 9))
 
 

@@ -18,6 +18,7 @@ from companion.navigator.changes import FALSE_AIRSPEED, USE_AIRSPEED
 from companion.navigator.fixes import BEACON_REACH_M
 from companion.navigator.own_error_model import LATENCY
 from companion.output.gate import withholding_reason
+from companion.output.source_switch import BELIEVED
 from companion.records import (
     PARALLEL,
     AirData,
@@ -328,39 +329,31 @@ def test_gnss_is_followed_where_beacons_at_wrong_places_answered_before_its_firs
     assert flown.error[flown.t > SETTLED_S].max() < 10.0
     for solution, off in zip(flown.solutions, flown.error, strict=True):
         if solution.t_ns > 20.5 * NS and off > BEACON_REACH_M:
-            assert withholding_reason(solution) == "navigation is untrusted"
+            assert solution.contradicted
             assert solution.protection > off
 
 
-def sent_beside_a_gnss_22_km_off(end_s: float, jammed: bool) -> tuple[list[bool], list[bool]]:
-    """Whether positions of one beacon may be sent: with GNSS, from 20 s to `end_s`; from 21 s after."""
+@pytest.mark.parametrize("jammed", [False, True])
+def test_a_position_of_one_beacon_is_contradicted_while_a_first_gnss_22_km_off_is_received(
+    jammed: bool,
+) -> None:
+    """And no longer. Not while the receiver reports jamming."""
     navigator = Navigator(OWN)
 
     def change(record: Any) -> Any:
         if not isinstance(record, Gnss):
             return record
-        if not 20 * NS <= record.t_ns < end_s * NS:
+        if not 20 * NS <= record.t_ns < 28 * NS:
             return None
         navigator.handle(GnssIntegrity(record.t_ns, record.rx_ns, record.receiver, 2 * jammed, 0))
         return replace(record, lat=record.lat + math.radians(0.2))
 
     flown = fly("air", change, legs=FIVE_MINUTES[:3], navigator=navigator)
-    sent = [(s.t_ns / NS, withholding_reason(s) is None) for s in flown.solutions]
-    return [is_sent for t, is_sent in sent if 20.5 < t < end_s], [
-        is_sent for t, is_sent in sent if t > end_s + 21.0
-    ]
-
-
-def test_the_position_of_a_beacon_is_withheld_while_a_first_gnss_contradicts_it_and_no_longer() -> None:
-    during, later = sent_beside_a_gnss_22_km_off(24.0, jammed=False)
-    assert during and not any(during)
-    assert later and all(later)
-
-
-def test_a_first_gnss_that_reports_jamming_withholds_no_position_of_a_beacon() -> None:
-    during, later = sent_beside_a_gnss_22_km_off(60.0, jammed=True)
-    assert during and all(during)
-    assert later and all(later)
+    assert set(flown.of("contradicted", 20.5, 28.0)) == {not jammed}
+    assert not flown.of("contradicted", 32.0).any()
+    assert set(flown.of("gnss_false", 20.5, 28.0) >= BELIEVED) == {not jammed}
+    assert flown.error.max() < 1000.0
+    assert all(withholding_reason(s) is None for s in flown.solutions)
 
 
 def test_two_beacons_that_agree_are_not_left_for_a_first_fix_of_gnss_22_km_away() -> None:

@@ -4,6 +4,7 @@ import math
 import random
 from collections import Counter
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -15,7 +16,7 @@ from companion.link import dialect, frame
 from companion.link.fields import deg_e7
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
-from companion.output.autopilot_output import OUT_OF_DRIFT, AutopilotOutput
+from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import CORRELATION_S, ENCODERS, Receiver
 from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
 from companion.output.source_switch import Situation
@@ -283,24 +284,77 @@ def test_origin_that_moves_is_followed_with_a_reset() -> None:
     assert after[-1].x == pytest.approx(SPEED * flight.seconds - 111.3, abs=5.0)
 
 
-@pytest.mark.flight
-def test_nothing_goes_out_of_a_beacon_22_km_off_and_then_gnss_at_once() -> None:
-    """Without GNSS it took an ArduPlane 22 km off; once GNSS was used, nothing went out for 47 s."""
+def displaced(name: str, key: str, off_deg: float) -> Callable[[str, dict[str, Any]], None]:
+    """Displace the latitude that one message states."""
 
-    def move(name: str, values: dict[str, Any]) -> None:
-        if name == "RSBN_MEASUREMENT":
-            values["beacon_lat"] += 2_000_000
+    def move(sent: str, values: dict[str, Any]) -> None:
+        if sent == name:
+            values[key] += round(off_deg * 1e7)
 
-    flight = Flight(configured("output.profile=ardupilot"), falsify=move)
-    flight.fly(20.0, gnss=False)
-    flight.fly(14.0, gnss=True)
+    return move
+
+
+def odometry(flight: Flight) -> list[tuple[float, float, int]]:
+    """Time, error (m) and reset counter of each ODOMETRY."""
     sent = [(at, m) for at, m in flight.sent if m.get_type() == "ODOMETRY"]
-    off = [math.hypot(m.x - SPEED * at, m.y - WIND_EAST * at) for at, m in sent]
-    assert max(off) < 20.0
-    assert 29.5 < sent[0][0] < 30.6
-    assert f"ODOMETRY withheld: {OUT_OF_DRIFT}" in flight.texts
+    return [(at, math.hypot(m.x - SPEED * at, m.y - WIND_EAST * at), m.reset_counter) for at, m in sent]
+
+
+@pytest.mark.flight
+def test_an_autopilot_with_gnss_receives_nothing_of_a_beacon_22_km_off_and_gnss_once_it_is_used() -> None:
+    """88 positions of the wrong place were sent, then none for 47 s, and ArduPlane did not arm."""
+    flight = Flight(
+        configured("output.profile=ardupilot"), falsify=displaced("RSBN_MEASUREMENT", "beacon_lat", 0.2)
+    )
+    flight.fly(1.5, gnss=False)
+    flight.fly(14.0, gnss=True)
+    sent = odometry(flight)
+    assert all(at < 2.0 for at, error, _ in sent if error >= 20.0)
+    assert 11.0 < next(at for at, error, _ in sent if error < 20.0) < 12.5
+    assert flight.source_set == 1 and LOST not in flight.texts
     assert sum("m off the beacon's position: one of them is wrong" in text for text in flight.texts) == 1
-    assert LOST not in flight.texts
+
+
+def test_a_position_that_was_not_sent_holds_no_later_one_back() -> None:
+    """The local origin was not known yet: a jump of 5 km was withheld for 22 s."""
+    output, beacon = AutopilotOutput(configured("output.profile=ardupilot")), solution_at(START)
+    gnss = solution_at(START + SECOND, lat=beacon.lat + math.radians(0.05))
+    unknown, known = (
+        Receiver("ardupilot", 1),
+        Receiver("ardupilot", 1, origin=LocalOrigin(1, 1, 1.0, 0.5, 0.0)),
+    )
+    assert not output.messages(beacon, ["ODOMETRY"], unknown)
+    assert [m.get_type() for m in output.messages(gnss, ["ODOMETRY"], known)] == ["ODOMETRY"]
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize("false_s", [0.3, 4.0, 8.0])
+def test_a_first_gnss_that_is_false_for_seconds_takes_no_autopilot_off_our_position(false_s: float) -> None:
+    """It flies by a beacon. Where the position was withheld, set 1 was requested 2 s later, 22 km off."""
+    flight = Flight(configured("output.profile=ardupilot"))
+    flight.fly(20.0, gnss=False)
+    assert flight.source_set == 2
+    flight.falsify = displaced("GPS_RAW_INT", "lat", 0.2)
+    flight.fly(false_s, gnss=True)
+    flight.fly(20.0, gnss=False)
+    sent = [(at, error) for at, error, _ in odometry(flight) if at > 15.0]
+    assert max(error for _, error in sent) < 300.0
+    assert max(b - a for (a, _), (b, _) in pairwise(sent)) < 0.5
+    assert flight.source_set == 2 and HAS_FIX not in flight.texts
+
+
+@pytest.mark.flight
+def test_an_autopilot_on_our_position_returns_to_a_gnss_that_a_wrong_beacon_contradicted() -> None:
+    flight = Flight(
+        configured("output.profile=ardupilot"), falsify=displaced("RSBN_MEASUREMENT", "beacon_lat", 0.2)
+    )
+    flight.fly(20.0, gnss=False)
+    assert flight.source_set == 2
+    flight.fly(12.0, gnss=True)
+    sent = odometry(flight)
+    assert flight.source_set == 1
+    assert sent[-1][1] < 20.0
+    assert {resets for at, error, resets in sent if error < 20.0} == {1}
 
 
 def test_core_rejects_a_configuration_with_feedback() -> None:

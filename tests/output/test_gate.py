@@ -147,15 +147,31 @@ def test_jump_within_the_old_accuracy_counts_as_a_reset() -> None:
 
 
 def test_where_the_position_was_given_up_the_next_one_goes_out_whole_and_is_counted() -> None:
-    gate = Gate(10.0)
-    gate.begin_again()  # nothing was sent: nothing to count
-    first = gate.admit(GOOD)
-    gate.begin_again()
-    second = gate.admit(moved(0.1, north=22e3))
+    gate, there = Gate(10.0), moved(0.1, north=22e3, restarts=2)
+    first = gate.admit(changed(restarts=1))  # nothing was sent before: nothing to count
+    second = gate.admit(there)
+    gate.retract()
+    again = gate.admit(there)
     assert isinstance(first, Position) and first.resets == 0
     assert isinstance(second, Position) and second.resets == 1
-    assert second.place[:2] == pytest.approx((moved(0.1, north=22e3).lat, moved(0.1, north=22e3).lon))
-    assert isinstance(gate.admit(moved(0.2, north=23e3)), str)
+    assert again == second
+    assert second.place[:2] == pytest.approx((there.lat, there.lon))
+    assert isinstance(gate.admit(moved(0.2, north=23e3, restarts=2)), str)
+
+
+def test_a_position_that_was_not_sent_is_no_reference() -> None:
+    """The local origin was not confirmed; then a jump of 5 km was withheld for 22 s, and nothing armed."""
+    gate = Gate(10.0)
+    gate.admit(moved(0.0, north=5e3))
+    gate.retract()
+    assert gate.admit(moved(0.1)) == Gate().admit(moved(0.1))
+    assert gate.admit(moved(0.2, north=5e3)) == "jump larger than its accuracy justifies"
+    poor = (2e4, 0.0, 0.0, 2e4, 0.0, 9.0)
+    gate.admit(moved(0.3, covariance=poor))
+    gate.admit(moved(0.4, north=300.0))
+    gate.retract()
+    on = gate.admit(moved(0.5, covariance=poor))
+    assert isinstance(on, Position) and on.resets == 0
 
 
 def test_jump_goes_out_in_steps_each_counted() -> None:

@@ -28,7 +28,7 @@ class _Child(NamedTuple):
     log_prior: float
     fault: int = NONE
     lie: Lie | None = None
-    drawn: int = NONE  # the fault whose lie is drawn: another than `fault` where that is of two
+    lie_of: int = NONE  # the fault whose lie it is: another than `fault` where that is of two
     scale: int = 0
     ends: bool = False
     undone: tuple[int, ...] = ()
@@ -331,8 +331,8 @@ def _with_children(bank: Bank, layout: Layout, children: list[_Child]) -> Bank:
             noise[i, a : a + layout.groups[g]] = 0.0
             fault[i, g], event[i], scale[i] = NONE, 1 + F + c.fault, 0
         elif c.lie is not None:
-            index, variance, places, density = layout.lie_prior(c.drawn, c.lie)
-            for state, sigma in layout.faults[c.drawn].shock:
+            index, variance, places, density = layout.lie_prior(c.lie_of, c.lie)
+            for state, sigma in layout.faults[c.lie_of].shock:
                 P[i, state, state] += sigma**2
             P[i[:, None], index, index] += variance
             for state, lie, s2 in zip(c.undone, index.tolist(), variance.tolist()):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import signal
 from pathlib import Path
@@ -122,6 +123,20 @@ def test_table_applies_the_limits() -> None:
     assert (bias.detected, bias.harmful, bias.misleading, bias.alarms_per_hour) == (0, 1, 1, 15.0)
     assert not bias.passed
     assert jam.bound_held is False
+
+
+@pytest.mark.parametrize(("fault", "harmful"), [("beacon-bias", 1), ("gnss-jump", 0)])
+def test_beside_a_healthy_gnss_a_fault_that_is_detected_excuses_no_error(fault: str, harmful: int) -> None:
+    found = [result(fault, 1, detected_s=1.0, largest_m=301.0, normal_m=20.0)]
+    assert command.summarise(found, CampaignLimits())[0].harmful == harmful
+
+
+def test_a_case_flies_all_of_its_faults() -> None:
+    faults = flight.scenario_of(FlightOrder("one-beacon", "beacon-anywhere-first", 1)).faults
+    assert [(fault.name, fault.end_s) for fault in faults] == [
+        ("beacon-anywhere", math.inf),
+        ("gnss-jam", 30.0),
+    ]
 
 
 def test_an_error_above_the_protection_level_is_misleading_or_flagged() -> None:
