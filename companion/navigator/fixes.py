@@ -39,6 +39,7 @@ from companion.navigator.state import (
     gnss_is_believed,
     held_s,
     hypotheses,
+    is_contradicted,
     is_jammed,
     source_name,
     sources,
@@ -307,15 +308,12 @@ def _left_for_gnss(state: State, record: Gnss, settings: Settings) -> Step:
 
     A beacon that is not where it states is likelier than a GNSS that is false from its first fix on.
     """
-    apart, before = _apart(state, record, settings), state.contradiction
-    if before is None or record.t_ns - before.last_ns > REFUSED_NS or is_jammed(state):
-        since_ns = record.t_ns
-    else:
-        since_ns = before.since_ns
+    apart, before = _apart(state, record, settings), is_contradicted(state, record.t_ns, settings)
+    since_ns = record.t_ns if before is None or is_jammed(state) else before.since_ns
     if record.t_ns - since_ns < REFUSED_NS:
         label, why = f"gnss {record.receiver}", "contradicts a position that began at a beacon, m"
         out: list[Output] = [Rejection(record.t_ns, record.rx_ns, label, why, apart, BEACON_REACH_M)]
-        if since_ns == record.t_ns and not is_jammed(state):
+        if before is None:
             text = f"{label} is {apart:.0f} m off the beacon's position: one of them is wrong"
             out.append(Event(record.t_ns, record.rx_ns, Severity.WARNING, text))
         now = Contradiction(since_ns, record.t_ns, apart)

@@ -38,6 +38,7 @@ from companion.navigator.state import (
     held_s,
     hypotheses,
     is_contradicted,
+    is_jammed,
     levelled,
     source_name,
     sources,
@@ -76,7 +77,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     t_ns = point.t_ns
     rests_on = sources(state, t_ns, settings)
     fixes, against = rests_on & FIXES, is_contradicted(state, t_ns, settings)
-    promised = None if against else bounded_trajectory.guaranteed(state, point)  # it rests on the beacon
+    promised = bounded_trajectory.guaranteed(state, point)
     leading = estimate(state, settings)
     state = structs.replace(state, leading=(bank, leading))
     candidates = _candidates(state, leading, nominal.pending_s, promised, settings)
@@ -93,7 +94,6 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     assert state.protection is not None
     # in between the estimate moves: by the triangle inequality the level holds about its new place
     protection = state.protection[1] + math.dist(error, state.protection[2:])
-    protection += against.apart_m if against else 0.0
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
     suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY]) or bool(against)
@@ -131,13 +131,13 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         inertial_age_s=max(0.0, (rx_ns - t_ns) * 1e-9),
         ahead=minimax_bound.ahead(bounded_trajectory.guarantee(state), config),
         sigma_velocity=math.hypot(math.sqrt(velocity_variance), settings.model.channel.velocity_noise),
-        protection=protection,
+        protection=protection + (against.apart_m if against else 0.0),
         trust=held.trust,
         gnss_false=max(_gnss_false(state) or 0.0, known.settings.believed) if against else _gnss_false(state),
         witness=witness,
         false_sources=false_sources,
         bounds=promised.bounds if promised else None,
-        contradicted=against is not None,
+        contradicted=against is not None and not is_jammed(state),
         restarts=state.restarts,
         parallel=tuple(
             ParallelEstimate(name, c.error_n, c.covariance)

@@ -187,11 +187,10 @@ def is_jammed(state: State) -> bool:
 
 
 def is_contradicted(state: State, t_ns: int, settings: Settings) -> Contradiction | None:
-    """The contradiction of a first GNSS that is still received and not jammed; None if there is none."""
+    """The contradiction of a first GNSS that is still received; None if there is none."""
     found, timeout_ns = state.contradiction, round(1e9 * settings.config.gnss.timeout_s)
-    if found is None or state.gnss_taken is not None or t_ns - found.last_ns > timeout_ns or is_jammed(state):
-        return None
-    return found
+    is_over = found is None or state.gnss_taken is not None or t_ns - found.last_ns > timeout_ns
+    return None if is_over else found
 
 
 def gnss_climb(state: State, t_ns: int) -> float:

@@ -29,7 +29,7 @@ from companion.output.gate import (
 )
 from companion.output.gnss_fusion import GnssFusion
 from companion.output.position_reset import PositionReset
-from companion.output.source_switch import BELIEVED, SourceSwitch
+from companion.output.source_switch import BELIEVED, STEADY_S, SourceSwitch
 from companion.records import (
     Event,
     FilterStatus,
@@ -43,6 +43,7 @@ from companion.records import (
 from companion.units import SECOND_NS
 
 DISPLAY_NAMES = {RESET: "external position"}
+SENDING_GAP_NS = 3 * SECOND_NS
 NOT_FUSED = frozenset({RESET, MESSAGES["gps_input"]})
 """A reset is no series of measurements; a receiver's accuracy is judged by limits of its own."""
 
@@ -65,6 +66,7 @@ class AutopilotOutput:
         self._gate, self._local_frame, self._monitor = _gate(config), LocalFrame(), WithholdingMonitor()
         self._position_reset, self._source_switch = PositionReset(), _source_switch(config)
         self._receivers = ReceiverChoice(config)
+        self._sending_ns = 0, 0  # since when without a gap, and when last, a position was sent
         self._events: list[Event] = []
 
     @property
@@ -135,7 +137,10 @@ class AutopilotOutput:
                     if reason is None:
                         encoded[name] = message
             self._add_event(self._monitor.update(DISPLAY_NAMES.get(name, name), reason, now))
-        if isinstance(position, Position) and not encoded:
+        if encoded:
+            first_ns, last_ns = self._sending_ns
+            self._sending_ns = first_ns if now - last_ns <= SENDING_GAP_NS else now, now
+        elif isinstance(position, Position):
             self._gate.retract()
         switched = PROFILES[self.config.output.profile].switched
         if by_set := switched.intersection(names):
@@ -185,9 +190,14 @@ class AutopilotOutput:
         output = self.config.output
         if not output.fits(receiver.autopilot):
             return f"the autopilot is not {output.profile}: set output.profile"
-        if solution.contradicted and not self._source_switch.is_on_companion:
-            return "GNSS contradicts it"  # an autopilot that rests on it goes on so until it is decided
+        if solution.contradicted and not self._is_relied_on(solution.rx_ns):
+            return "GNSS contradicts it"
         return self._position_reset.withholding_reason(position) if name == RESET else None
+
+    def _is_relied_on(self, now_ns: int) -> bool:
+        """Return whether an autopilot may fly by what has been sent: then it goes on until it is decided."""
+        first_ns, last_ns = self._sending_ns
+        return now_ns - last_ns <= SENDING_GAP_NS and last_ns - first_ns >= STEADY_S * SECOND_NS
 
     def _add_event(self, event: Event | None) -> None:
         if event is not None:

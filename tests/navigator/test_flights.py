@@ -351,9 +351,25 @@ def test_a_position_of_one_beacon_is_contradicted_while_a_first_gnss_22_km_off_i
     flown = fly("air", change, legs=FIVE_MINUTES[:3], navigator=navigator)
     assert set(flown.of("contradicted", 20.5, 28.0)) == {not jammed}
     assert not flown.of("contradicted", 32.0).any()
-    assert set(flown.of("gnss_false", 20.5, 28.0) >= BELIEVED) == {not jammed}
+    assert set(flown.of("gnss_false", 20.5, 28.0) >= BELIEVED) == {True}
+    assert set(flown.of("protection", 20.5, 28.0) > 22e3) == {True}
     assert flown.error.max() < 1000.0
     assert all(withholding_reason(s) is None for s in flown.solutions)
+
+
+def test_a_first_gnss_22_km_off_withholds_no_position_that_coasts() -> None:
+    """Out of sight of two beacons: it counted in the protection level, which made the position untrusted."""
+
+    def change(record: Any) -> Any:
+        if not isinstance(record, Gnss):
+            return record
+        is_received = 74 * NS <= record.t_ns < 78 * NS
+        return replace(record, lat=record.lat + math.radians(0.2)) if is_received else None
+
+    flown = fly("air", change, legs=FIVE_MINUTES[:3], rsbn=((60.0, 1e9),), others=(Beacon(2, 60.45, 30.0),))
+    assert flown.of("contradicted", 74.5, 78.0).all()
+    assert all(withholding_reason(s) is None for s in flown.solutions if s.t_ns < 85 * NS)
+    assert flown.error[flown.t < 85.0].max() < 500.0
 
 
 def test_two_beacons_that_agree_are_not_left_for_a_first_fix_of_gnss_22_km_away() -> None:

@@ -327,20 +327,33 @@ def test_a_position_that_was_not_sent_holds_no_later_one_back() -> None:
     assert [m.get_type() for m in output.messages(gnss, ["ODOMETRY"], known)] == ["ODOMETRY"]
 
 
+LIVED_BY = {"ardupilot": (3, "ODOMETRY"), "px4": (12, "GLOBAL_POSITION_SENSOR")}
+
+
 @pytest.mark.flight
-@pytest.mark.parametrize("false_s", [0.3, 4.0, 8.0])
-def test_a_first_gnss_that_is_false_for_seconds_takes_no_autopilot_off_our_position(false_s: float) -> None:
+@pytest.mark.parametrize("profile", LIVED_BY)
+@pytest.mark.parametrize("case", ["0.3 s", "4 s", "8 s", "no answer", "three times", "reported"])
+def test_a_first_gnss_that_is_false_for_seconds_takes_no_autopilot_off_our_position(
+    case: str, profile: str
+) -> None:
     """It flies by a beacon. Where the position was withheld, set 1 was requested 2 s later, 22 km off."""
-    flight = Flight(configured("output.profile=ardupilot"))
+    autopilot, name = LIVED_BY[profile]
+    flight = Flight(configured(f"output.profile={profile}"), autopilot)
+    flight.answers = case != "no answer"
     flight.fly(20.0, gnss=False)
-    assert flight.source_set == 2
     flight.falsify = displaced("GPS_RAW_INT", "lat", 0.2)
-    flight.fly(false_s, gnss=True)
-    flight.fly(20.0, gnss=False)
-    sent = [(at, error) for at, error, _ in odometry(flight) if at > 15.0]
-    assert max(error for _, error in sent) < 300.0
-    assert max(b - a for (a, _), (b, _) in pairwise(sent)) < 0.5
-    assert flight.source_set == 2 and HAS_FIX not in flight.texts
+    for _ in range(3 if case == "three times" else 1):
+        if case == "reported":
+            flight.send("GNSS_INTEGRITY", id=0, jamming_state=3, spoofing_state=3)
+        flight.fly({"0.3 s": 0.3, "4 s": 4.0, "8 s": 8.0, "three times": 0.2}.get(case, 7.0), gnss=True)
+        flight.fly(5.0, gnss=False)
+    flight.fly(5.0)
+    sent = [at for at, message in flight.sent if message.get_type() == name and at > 15.0]
+    assert max(b - a for a, b in pairwise([15.0, *sent, flight.seconds])) < 1.2
+    if profile == "ardupilot":
+        assert max(error for at, error, _ in odometry(flight) if at > 15.0) < 300.0
+        assert HAS_FIX not in flight.texts
+        assert flight.source_set == 2 or case == "no answer"
 
 
 @pytest.mark.flight
