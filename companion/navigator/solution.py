@@ -75,9 +75,9 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     config, known = settings.config, hypotheses(state, settings)
     point = levelled(nominal.point, state)
     t_ns = point.t_ns
+    promised = bounded_trajectory.guaranteed(state, point)
     rests_on = sources(state, t_ns, settings)
     fixes, against = rests_on & FIXES, is_contradicted(state, t_ns, settings)
-    promised = bounded_trajectory.guaranteed(state, point)
     leading = estimate(state, settings)
     state = structs.replace(state, leading=(bank, leading))
     candidates = _candidates(state, leading, nominal.pending_s, promised, settings)

@@ -39,6 +39,7 @@ FIELDS = {
     "claimed_n": "m: north, east; expected r.m.s. error",
     "climb": "m/s, up",
     "connected": "whether the link is open",
+    "contradicted": "whether a first GNSS contradicts the beacon at which the position began",
     "correction_n": "m: north, east; inertial position minus fix",
     "cost": "chi-square of the residuals (no unit)",
     "covariance": "m^2: north-north, north-east, north-down, east-east, east-down, down-down",
@@ -95,6 +96,7 @@ FIELDS = {
     "reason": "text",
     "received": "count of frames",
     "receiver": "number of the GNSS receiver",
+    "restarts": "how often the position was given up",
     "roll": "rad",
     "round_trip_ns": "ns",
     "satellites": "count",
@@ -135,8 +137,6 @@ FIELDS = {
     "what": "what was reset",
     "widening": "factor of the bounds by residuals beyond the stated errors, 1 if none",
     "witness": "whether a beacon confirms the solution",
-    "contradicted": "whether a first GNSS contradicts the beacon at which the position began",
-    "restarts": "how often the position was given up and begun again",
     "x_n": "m from the local origin: north, east, down",
 }  # fmt: skip
 

@@ -82,10 +82,7 @@ OWN_CHANNEL = {
 
 
 class FaultCase(NamedTuple):
-    """Fault of a campaign and the source it concerns: prefix of rejections, bits of `Solution.sources`.
-
-    `also`: what else is not as usual.
-    """
+    """Fault of a campaign, the source it concerns (prefix of rejections, bits of `Solution.sources`), more."""
 
     fault: Fault | None
     concerns: str = ""

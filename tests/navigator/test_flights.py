@@ -337,7 +337,7 @@ def test_gnss_is_followed_where_beacons_at_wrong_places_answered_before_its_firs
 def test_a_position_of_one_beacon_is_contradicted_while_a_first_gnss_22_km_off_is_received(
     jammed: bool,
 ) -> None:
-    """And no longer. Not while the receiver reports jamming."""
+    """And no longer; not while the receiver reports jamming, but GNSS is not believed then either."""
     navigator = Navigator(OWN)
 
     def change(record: Any) -> Any:
