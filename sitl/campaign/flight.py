@@ -82,7 +82,7 @@ OWN_CHANNEL = {
 
 
 class FaultCase(NamedTuple):
-    """Fault of a campaign, the source it concerns (prefix of rejections, bits of `Solution.sources`), more."""
+    """Fault, source it concerns (prefix of rejections, bits of `Solution.sources`), and further faults."""
 
     fault: Fault | None
     concerns: str = ""
