@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,34 @@ from companion.estimate.bank.readout import level_rows
 from companion.estimate.bank.settings import Settings
 from companion.estimate.bank.state import Bank, families, normalised, picked
 from companion.units import Floats
+
+PROTECTED, HEAVIEST, OLDEST, IMPROBABLE, OTHER = range(5)
+"""Ranks: protected; the heaviest and the oldest of a class; below `class_floor` at best; others."""
+BEYOND_QUOTA = 3  # behind all others
+
+
+class _Key(NamedTuple):
+    """Class of a row: its family, last event, whether the rate of its lie changes, and its bin of age."""
+
+    family: int
+    event: int
+    bends: bool
+    age: int
+
+
+class _Rows(NamedTuple):
+    """The rows as lists (plain numbers are several times faster than elements of arrays), and the quota of
+    each family; `order` has the heaviest first, `active` counts faults.
+    """
+
+    order: list[int]
+    keys: list[_Key]
+    logs: list[float]
+    since: list[float]
+    scale: list[int]
+    grade: list[int]
+    active: list[int]
+    quota: dict[int, int]
 
 
 def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
@@ -38,88 +67,102 @@ def reduce(bank: Bank, layout: Layout, settings: Settings) -> Bank:
     -------
     Bank : with at most `settings.rows` rows; covariances made symmetric.
     """
-    rows = len(bank.L)
-    if rows <= settings.rows:
+    if len(bank.L) <= settings.rows:
         return bank._replace(P=_symmetric(bank.P))
-    L, family = bank.L, families(bank)
+    rows = _listed(bank, layout, settings)
+    rank = _ranks(rows, layout, settings)
+    for i in (*level_rows(bank, layout, 3, settings.risk).tolist(), *_carrying(rows, settings)):
+        rank[i] = PROTECTED
+    used = dict.fromkeys(rows.quota, 0)
+    for i in sorted(rows.order, key=rank.__getitem__):
+        family = rows.keys[i].family
+        used[family] += 1
+        if rank[i] and used[family] > rows.quota[family]:
+            rank[i] += BEYOND_QUOTA
+    best = sorted(rows.order, key=rank.__getitem__)
+    keep, dropped = best[: settings.rows], set(best[settings.rows :])
+    return _merged(bank, sorted(keep), [i for i in rows.order if i in dropped], rows.keys, settings)
+
+
+def _listed(bank: Bank, layout: Layout, settings: Settings) -> _Rows:
+    family = families(bank)
     bins = np.floor(
         np.log(np.maximum((bank.t - bank.since) / settings.age_s, 0.1)) / math.log(settings.age_ratio) + 1.0
     ).clip(0.0)
     # ties (children of one parent) in an order that does not depend on where the rows stand
-    ties = (bank.since, bank.scale, bank.event, family, np.round(-L, 9))
-    order = np.lexsort(ties).tolist()
+    ties = (bank.since, bank.scale, bank.event, family, np.round(-bank.L, 9))
     # lies that may change their rate are a class of their own: they pay more, and must outlive what they beat
     bends = bank.noise.any(axis=1)
     if layout.accelerations[2].size:
         bends |= (bank.P[:, layout.accelerations[2], layout.accelerations[2]] > 0.0).any(axis=1)
-    label = 2 * bank.event + bends
-    keys = list(zip(family.tolist(), label.tolist(), bins.astype(int).tolist()))
-    # lists: plain numbers are several times faster than elements of arrays
-    logs, since, scales, grade = L.tolist(), bank.since.tolist(), bank.scale.tolist(), bank.grade.tolist()
-    active = (bank.fault != NONE).sum(axis=1).tolist()
-    faults = dict(zip(family.tolist(), bank.fault.tolist()))
-    quota = {code: _quota(layout, fault) for code, fault in faults.items()}
-    # rank of a row: 0 protected, 1 heaviest of its class, 2 oldest of its class, 3 and 4 others
-    rank = [4] * rows
-    oldest: dict[tuple[int, int, int], int] = {}
-    whole = {0, keys[order[0]][0]}  # families that keep each grade and jump: nothing false, and the leading
-    by_fault: set[int] = set()
-    jumped: set[tuple[int, int]] = set()
-    first_jump = layout.jump_event(0)
-    by_scale: set[tuple[int, ...]] = set()
-    graded: set[tuple[int, int]] = set()
-    for i in order:
-        key = keys[i]
-        j = oldest.get(key)
-        if j is None:
-            rank[i] = 1
-        if j is None or since[i] < since[j]:
-            oldest[key] = i
-        scale = (*key, scales[i])
-        if key[2] <= 1 and scale not in by_scale:
-            by_scale.add(scale)
-            rank[i] = min(rank[i], 2)
-        if key[0] not in by_fault and active[i] <= 1:
-            by_fault.add(key[0])
-            rank[i] = 0
-        event = key[1] // 2
-        may_jump = event >= first_jump and (
-            logs[i] >= settings.class_floor or layout.jumps[event - first_jump].rate_h > 0.0
-        )
-        if may_jump and key[0] in whole and (key[0], event) not in jumped:
-            jumped.add((key[0], event))
-            rank[i] = 0
-        beside = event >= first_jump and key[0] not in whole and active[i] == 1
-        if rank[i] == 1 and beside and quota[key[0]] == len(layout.grades) + 1:
-            rank[i] = 2
-        alive = key[0] == 0 or logs[i] >= settings.class_floor
-        if alive and (active[i] <= 1 or key[0] in whole) and (key[0], grade[i]) not in graded:
-            graded.add((key[0], grade[i]))
-            rank[i] = 0 if key[0] in whole else min(rank[i], 1)
-    for i in oldest.values():
-        rank[i] = min(rank[i], 2)
+    codes, events = family.tolist(), bank.event.tolist()
+    return _Rows(
+        order=np.lexsort(ties).tolist(),
+        keys=list(map(_Key, codes, events, np.asarray(bends).tolist(), bins.astype(int).tolist())),
+        logs=bank.L.tolist(),
+        since=bank.since.tolist(),
+        scale=bank.scale.tolist(),
+        grade=bank.grade.tolist(),
+        active=(bank.fault != NONE).sum(axis=1).tolist(),
+        quota={code: _quota(layout, fault) for code, fault in dict(zip(codes, bank.fault.tolist())).items()},
+    )
+
+
+def _ranks(rows: _Rows, layout: Layout, settings: Settings) -> list[int]:
+    """Return the rank of each row by its class, family, grade and jump; the lowest are kept."""
+    order, keys, logs, active = rows.order, rows.keys, rows.logs, rows.active
+    # of what is written to a dict last remains: of the rows from the lightest on, the heaviest
+    lightest_first, family = order[::-1], [key.family for key in keys]
+    youngest_first = sorted(order, key=rows.since.__getitem__)[::-1]
+    rank = [OTHER] * len(keys)
+    for i in {keys[i]: i for i in youngest_first}.values():
+        rank[i] = OLDEST
+    for i in {(keys[i], rows.scale[i]): i for i in lightest_first if keys[i].age <= 1}.values():
+        rank[i] = OLDEST
+    for i in {keys[i]: i for i in lightest_first}.values():
+        rank[i] = HEAVIEST
+    for i in {family[i]: i for i in lightest_first if active[i] <= 1}.values():
+        rank[i] = PROTECTED
+    whole = {0, family[order[0]]}  # families that keep each grade and jump: nothing false, and the leading
+    first_jump, least = layout.jump_event(0), len(layout.grades) + 1
+    jumped = [i for i in lightest_first if keys[i].event >= first_jump]
+    for i in jumped:
+        is_beside_a_fault = active[i] == 1 and family[i] not in whole
+        if rank[i] == HEAVIEST and is_beside_a_fault and rows.quota[family[i]] == least:
+            rank[i] = OLDEST
+    living = {
+        (family[i], keys[i].event): i
+        for i in jumped
+        if family[i] in whole
+        and (logs[i] >= settings.class_floor or layout.jumps[keys[i].event - first_jump].rate_h > 0.0)
+    }
+    for i in living.values():
+        rank[i] = PROTECTED
+    graded = {
+        (family[i], rows.grade[i]): i
+        for i in lightest_first
+        if (active[i] <= 1 or family[i] in whole) and (family[i] == 0 or logs[i] >= settings.class_floor)
+    }
+    for (code, _), i in graded.items():
+        rank[i] = PROTECTED if code in whole else min(rank[i], HEAVIEST)
     log_risk = math.log(settings.risk)
-    for i in range(rows):
+    for i in order:
         if rank[i] and active[i] > 1 and logs[i] < log_risk:
             rank[i] += 1
         if rank[i] and logs[i] < settings.class_floor:
-            rank[i] = max(rank[i], 3)
-    for i in level_rows(bank, layout, 3, settings.risk).tolist():
-        rank[i] = 0
-    # the rows that carry the weight, up to half of the room
-    mass = np.cumsum(np.exp(L[order[: settings.rows // 2]]))
-    for i, before in zip(order, (0.0, *mass.tolist())):
-        if before < 1.0 - settings.dropped:
-            rank[i] = 0
-    # quotas: the rows of a family beyond its quota rank behind all others
-    used = dict.fromkeys(quota, 0)
-    for i in sorted(order, key=rank.__getitem__):
-        f = keys[i][0]
-        used[f] += 1
-        if rank[i] and used[f] > quota[f]:
-            rank[i] += 3
-    kept = set(sorted(order, key=rank.__getitem__)[: settings.rows])
-    return _merged(bank, sorted(kept), [i for i in order if i not in kept], keys, settings)
+            rank[i] = max(rank[i], IMPROBABLE)
+    return rank
+
+
+def _carrying(rows: _Rows, settings: Settings) -> list[int]:
+    """Return the rows that carry the weight, up to half of the room."""
+    carrying, mass = [], 0.0
+    for i in rows.order[: settings.rows // 2 + 1]:
+        if mass >= 1.0 - settings.dropped:
+            break
+        carrying.append(i)
+        mass += math.exp(rows.logs[i])
+    return carrying
 
 
 def _quota(layout: Layout, fault: list[int]) -> int:
@@ -132,15 +175,13 @@ def _quota(layout: Layout, fault: list[int]) -> int:
     return len(layout.grades) + sum(j.quota for j in layout.jumps) + 2
 
 
-def _merged(
-    bank: Bank, keep: list[int], dropped: list[int], keys: list[tuple[int, int, int]], settings: Settings
-) -> Bank:
+def _merged(bank: Bank, keep: list[int], dropped: list[int], keys: list[_Key], settings: Settings) -> Bank:
     """The rows `keep`; the weights of `dropped`, in this order, go where `reduce` states."""
     kept = picked(bank, keep)
     L, grade, noise = bank.L.tolist(), bank.grade.tolist(), bank.noise.tolist()
     x, P = kept.x, _symmetric(kept.P)
     place = {row: k for k, row in enumerate(keep)}
-    by_key: dict[tuple[int, int, int], list[int]] = {}
+    by_key: dict[_Key, list[int]] = {}
     for i in keep:
         by_key.setdefault(keys[i], []).append(i)
     log_ratio = math.log(settings.merge_ratio)
