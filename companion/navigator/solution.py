@@ -85,24 +85,23 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
     if (rests_on & Source.GNSS if leads == "restrictive" else fixes) or leads not in candidates:
         leads = "kalman"
     error, velocity_error, (var_n, cov, var_e), velocity_variance = candidates[leads]
-    position = np.array(error) - nominal.pending_s * np.array(candidates["kalman"].velocity_error_n)
-    false_sources: tuple[tuple[str, float], ...] = ()
-    if state.protection is None or t_ns - state.protection[0] >= PROTECTION_NS:
-        false_sources = tuple((source_name(i, state), p) for i, p in enumerate(state.false))
-        radius = banks.protection_level(bank, known.layout, config.integrity.risk, position)
+    lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
+    if abs(lat) > math.pi / 2.0:
+        why = f"estimated latitude {math.degrees(lat):.1f} deg is beyond the pole: no solution"
+        return state, [Rejection(t_ns, rx_ns, "solution", why, abs(lat), math.pi / 2.0)]
+    is_due = state.protection is None or t_ns - state.protection[0] >= PROTECTION_NS
+    false_sources = tuple((source_name(i, state), p) for i, p in enumerate(state.false)) if is_due else ()
+    if is_due:
+        before = np.array(error) - nominal.pending_s * np.array(candidates["kalman"].velocity_error_n)
+        radius = banks.protection_level(bank, known.layout, config.integrity.risk, before)
         state = structs.replace(state, protection=(t_ns, radius, *error))
-    assert state.protection is not None
-    # in between the estimate moves: by the triangle inequality the level holds about its new place
-    protection = state.protection[1] + math.dist(error, state.protection[2:])
+    protection = _level_about(error, state)
     bound_n, velocity_bound_n = _about(error, velocity_error, promised)
     witness = bool(rests_on & (Source.AZIMUTH | Source.RANGE))
     suspicion = _is_suspicious(state, banks.heard_sources(bank, known.layout)[VELOCITY]) or bool(against)
     held = _trust(state.held, trust.Evidence(bool(fixes), suspicion, protection), t_ns, config)
     north, east, down = point.v_n
-    lat, lon, alt = displace(*point.position, -error[0], -error[1], 0.0)
-    if abs(lat) > math.pi / 2.0:
-        why = f"estimated latitude {math.degrees(lat):.1f} deg is beyond the pole: no solution"
-        return state, [Rejection(t_ns, rx_ns, "solution", why, abs(lat), math.pi / 2.0)]
+    height = height_error.at(state.level, nominal.point, held_s(state, t_ns))
     last = max((t for t in (state.gnss_ns, state.rsbn_ns) if t is not None), default=t_ns)
     solution = Solution(
         t_ns=t_ns,
@@ -113,14 +112,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         lon=lon,
         alt_msl=alt,
         v_n=(north - velocity_error[0], east - velocity_error[1], down),
-        covariance=(
-            var_n,
-            cov,
-            0.0,
-            var_e,
-            0.0,
-            height_error.at(state.level, nominal.point, held_s(state, t_ns)).covariance[0],
-        ),
+        covariance=(var_n, cov, 0.0, var_e, 0.0, height.covariance[0]),
         error_n=error,
         velocity_error_n=velocity_error,
         sources=int(rests_on),
@@ -139,11 +131,7 @@ def solve(state: State, rx_ns: int, settings: Settings) -> Step:
         bounds=promised.bounds if promised else None,
         contradicted=against is not None and not is_jammed(state),
         restarts=state.restarts,
-        parallel=tuple(
-            ParallelEstimate(name, c.error_n, c.covariance)
-            for name in config.estimator.parallel
-            if (c := candidates.get(name)) is not None
-        ),
+        parallel=_parallel(candidates, config),
     )
     return structs.replace(state, held=held), [solution]
 
@@ -195,6 +183,22 @@ def _velocity_growth(state: State, dt: float, settings: Settings) -> float:
     if nominal.interval.by == "foreign":
         return model.foreign_noise_m_s**2
     return model.hold_m_s_sqrt_s**2 * dt if nominal.interval.by in HELD else 0.0
+
+
+def _level_about(error: Vector2, state: State) -> float:
+    """Protection level about `error` (m): since it was computed the estimate has moved, and by the triangle
+    inequality it holds about the new place with the distance added.
+    """
+    assert state.protection is not None
+    return state.protection[1] + math.dist(error, state.protection[2:])
+
+
+def _parallel(candidates: dict[str, _Estimate], config: Config) -> tuple[ParallelEstimate, ...]:
+    return tuple(
+        ParallelEstimate(name, c.error_n, c.covariance)
+        for name in config.estimator.parallel
+        if (c := candidates.get(name)) is not None
+    )
 
 
 def _about(
