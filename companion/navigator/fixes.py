@@ -100,7 +100,11 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         velocity = measurements.gnss_velocity(bank, known, channel, record, nominal.point, nominal.a_n, noise)
         bank = velocity.bank
     is_measured = velocity is not None
-    state, v_n = _latency_velocity(structs.replace(state, bank=bank), record.t_ns, is_measured)
+    is_believed = (
+        velocity is not None and velocity.accepted and not (state.reported and state.reported[VELOCITY])
+    )
+    stated = record.v_n[:2] if record.v_n is not None and is_believed else None
+    state, v_n = _latency_velocity(structs.replace(state, bank=bank), record.t_ns, is_measured, stated)
     shows_latency = is_measured or driver(state) not in HELD
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
     restarted = list[Output]()
@@ -158,15 +162,18 @@ def _believed(state: State, record: Gnss, settings: Settings) -> Step:
     return state, out
 
 
-def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State, Vector2]:
+def _latency_velocity(
+    state: State, t_ns: int, is_measured: bool, stated: Vector2 | None
+) -> tuple[State, Vector2]:
     """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
 
     The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
-    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU, and by airspeed
-    where GNSS states no velocity (`is_measured`), the nominal velocity is taken less a slow mean of its
-    estimated error; a held velocity is far off in every turn. After
-    a silence the velocity must be that of the fix: 5 m/s off in the first of two positions, they seemed to
-    measure a latency of 0.13 s.
+    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU it is the velocity
+    that GNSS states, if that is believed (`stated`). Else, and by airspeed where GNSS states none
+    (`is_measured`), it is the nominal velocity less a slow mean of its estimated error, which a wrong
+    accelerometer leaves behind: 1 m/s^2 put the position 16 m off a GNSS late by 0.35 s. A held velocity is
+    far off in every turn. After a silence the velocity must be that of the fix: 5 m/s off in the first of two
+    positions, they seemed to measure a latency of 0.13 s.
     """
     v_n, by = estimated_velocity(state), driver(state)
     if by != "imu" and (is_measured or by not in ("air", "foreign")):
@@ -174,6 +181,8 @@ def _latency_velocity(state: State, t_ns: int, is_measured: bool) -> tuple[State
     assert state.nominal is not None
     nominal, mean = state.nominal.point.v_n, state.velocity_error
     north, east = nominal[0] - v_n[0], nominal[1] - v_n[1]
+    if stated is not None:  # a mean that is needed later begins at the last one
+        return structs.replace(state, velocity_error=VelocityError(t_ns, north, east)), stated
     if mean is not None:
         part = -math.expm1(-max(t_ns - mean.t_ns, 0) * 1e-9 / MEAN_S)
         north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
