@@ -91,6 +91,8 @@ class AutopilotOutput:
                 self._source_switch.note_other(record)
         elif isinstance(record, GlobalPosition | FilterStatus):
             self._position_reset.receive(record)
+            if isinstance(record, GlobalPosition):
+                self._source_switch.receive(record)
         elif isinstance(record, RsbnFix):
             sigma_azimuth, sigma_range = beacon_sigmas(record, self.config.rsbn)
             self._source_switch.receive(

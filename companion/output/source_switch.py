@@ -25,7 +25,8 @@ from typing import NamedTuple
 from companion.estimate.bank.settings import DEFAULT
 from companion.link.dialect import Message, command_long, mavlink
 from companion.output.beacon_witness import BeaconWitness
-from companion.records import Event, Gnss, RsbnFix, Severity, Solution
+from companion.output.flown_receiver import FlownReceiver
+from companion.records import Event, GlobalPosition, Gnss, RsbnFix, Severity, Solution
 from companion.units import SECOND_NS
 
 GNSS_SET, COMPANION_SET = 1, 2
@@ -100,6 +101,7 @@ class Situation(NamedTuple):
     witness: bool  # a beacon is received and believed, and itself contradicts GNSS
     sent_s: float  # our position has gone out
     stopped_s: float  # our position has not gone out, after it did
+    by_other: bool = False  # the autopilot flies by a GNSS receiver that is not the one in use
 
 
 class Predicate(NamedTuple):
@@ -111,8 +113,8 @@ class Predicate(NamedTuple):
 
 
 def is_held_false(s: Situation) -> bool:
-    """Whether GNSS is false beyond doubt, with a beacon that contradicts it."""
-    return s.gnss_false is not None and s.gnss_false > FALSE and s.witness
+    """Whether the GNSS that the autopilot flies by is false beyond doubt, and a beacon contradicts it."""
+    return s.gnss_false is not None and s.gnss_false > FALSE and s.witness and not s.by_other
 
 
 GNSS_LOST = Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost, using companion")
@@ -187,6 +189,7 @@ class SourceSwitch:
     def __init__(self) -> None:
         self._fix, self._no_fix, self._sent = ConditionTimer(), ConditionTimer(), ConditionTimer()
         self._receiver, self._receiver_ns = 0, 0  # its number, and when it last reported: 0 for never
+        self._flown = FlownReceiver()
         self._other_fix_ns = 0  # when a receiver that is not in use last reported a fix
         self._sent_ns: int | None = None
         self._slack_ns = 0  # by which two positions of a slow output may be further apart than `MAX_GAP_NS`
@@ -207,22 +210,27 @@ class SourceSwitch:
         self._asked_ns = 0  # when the receiver's message was last requested
         self._events: list[Event] = []
 
-    def receive(self, record: Gnss | RsbnFix) -> None:
-        """Note what the autopilot's receiver reports, or a beacon.
+    def receive(self, record: Gnss | GlobalPosition | RsbnFix) -> None:
+        """Note what the autopilot's receiver reports, the autopilot's own position, or a beacon.
 
         A repeated GNSS fix counts: the receiver still reports.
         """
+        if isinstance(record, GlobalPosition):
+            self._flown.receive(record)
+            return
         doubt = None if self._solution is None else self._solution.gnss_false
         self._witness.receive(record, is_believed=doubt is not None and doubt < BELIEVED)
         if isinstance(record, RsbnFix):
             return
         now = record.rx_ns
         self._receiver, self._receiver_ns = record.receiver, now
+        self._flown.receive(record)
         self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
         self._no_fix.update(not record.has_3d_fix, now, 3 * SECOND_NS)
 
     def note_other(self, record: Gnss) -> None:
         """Note what a receiver reports that is not in use: with its fix the autopilot has GNSS."""
+        self._flown.receive(record, is_used=False)
         if record.has_3d_fix:
             self._other_fix_ns = record.rx_ns
 
@@ -253,6 +261,7 @@ class SourceSwitch:
             witness=fresh and solution is not None and solution.witness and self._witness.contradicts,
             sent_s=max(-1.0, sent_s),  # a single position of a slow output is not steady
             stopped_s=stopped_ns * 1e-9,
+            by_other=self._flown.is_other(now_ns),
         )
 
     @property
@@ -302,7 +311,7 @@ class SourceSwitch:
         self._required, self._reason = decision
         if self._held is not None:
             if is_new and self._required != self._held:
-                need = f"{self.name(self._required)} needed ({self._reason})"
+                need = f"{self.name(self._required)} needed ({self._reason.partition(',')[0]})"
                 text = f"{need}, but {self.name(self._held)} selected by hand"
                 self._add_event(Severity.WARNING, text, now_ns)
         elif self._required != self._wanted or self._is_again_due(now_ns):

@@ -33,7 +33,7 @@ from companion.output.source_switch import (
     required_set,
     selected,
 )
-from companion.records import Gnss, RsbnFix
+from companion.records import GlobalPosition, Gnss, RsbnFix
 from companion.units import SECOND_NS
 from tests.solutions import solution_at
 
@@ -65,6 +65,7 @@ TABLE: list[tuple[str, dict[str, Any], int | None]] = [
     ("never received, a companion alone", {**SILENT, "silent_s": -1.0}, None),
     ("GNSS false with a witness", LIE, 2),
     ("GNSS false without a witness", {**LIE, "witness": False}, None),
+    ("GNSS false, but the autopilot flies by the other receiver", {**LIE, "by_other": True}, None),
     ("GNSS probably false", {**LIE, "gnss_false": FALSE}, None),
     ("GNSS false, our position does not go out", {**LIE, **MUTE}, None),
     ("GNSS suspect", {"gnss_false": 0.5}, None),
@@ -144,6 +145,7 @@ class Flight:
         self.switch, self.now, self.answer = SourceSwitch(), 10**12, answer
         self.sends_when_asked = sends_when_asked
         self.lack = ""
+        self.drawn_m = 0.0  # by which GNSS is drawn off, east
         self.requests: list[tuple[float, int, int]] = []
         self.asked: list[float] = []
         self.reports: list[tuple[float, str]] = []
@@ -189,11 +191,34 @@ class Flight:
         return self.now * 1e-9
 
     def gnss(self, fix: int) -> Gnss:
-        return Gnss(self.now, self.now, 0, self.now // 1000, fix, 1.0, 0.5, 100.0)
+        lat, lon, alt = displace(1.0, 0.5, 100.0, 0.0, self.drawn_m, 0.0)
+        return Gnss(self.now, self.now, 0, self.now // 1000, fix, lat, lon, alt)
 
     @property
     def sets(self) -> list[int]:
         return [source_set for _, source_set, _ in self.requests]
+
+
+@pytest.mark.parametrize(
+    ("other_m", "own_m", "requested"),
+    [(0.0, 2.0, [1]), (78.0, 79.0, [1, 2]), (0.0, 40.0, [1, 2]), (0.0, 80.0, [1, 2])],
+    ids=["it flies by the other", "both are drawn off alike", "it blends them", "it flies by the false one"],
+)
+def test_a_false_receiver_that_the_autopilot_does_not_fly_by_takes_it_off_no_gnss(
+    other_m: float, own_m: float, requested: list[int]
+) -> None:
+    """Flown (GPS_AUTO_SWITCH 1): the first receiver 80 m off, the autopilot 1 m off by the second one."""
+    flight = Flight()
+    flight.fly(20.0)
+    for _ in range(40):
+        place, now = displace(1.0, 0.5, 100.0, 0.0, 80.0, 0.0), flight.now
+        lat, lon, alt = displace(*place, 0.0, other_m - 80.0, 0.0)
+        flight.switch.note_other(Gnss(now, now, 1, now // 1000, 3, lat, lon, alt))
+        lat, lon, alt = displace(*place, 0.0, own_m - 80.0, 0.0)
+        flight.switch.receive(GlobalPosition(now, now, lat, lon, alt, (0.0, 0.0, 0.0), 0.0))
+        flight.drawn_m = 80.0
+        flight.fly(1.0, false=0.9999)
+    assert flight.sets == requested
 
 
 def test_set_2_on_gnss_loss_and_set_1_on_its_return() -> None:
@@ -491,7 +516,7 @@ def test_a_persons_choice_is_respected_until_he_hands_back(how: Any) -> None:
     assert flight.sets == [1, 2]
     assert [text for _, text in flight.reports[2:]] == [
         "EKF source set 1 selected by hand: the companion does not switch",
-        "EKF source set 2 needed (GNSS is lost, using companion), but EKF source set 1 selected by hand",
+        "EKF source set 2 needed (GNSS is lost), but EKF source set 1 selected by hand",
     ]
     by_others(flight, *how(2))
     flight.fly(10.0, fix=False)
