@@ -76,7 +76,7 @@ class Changes:
         found: list[tuple[Severity, str]] = []
         beliefs = _announced(self._beliefs, state.reported)
         if beliefs != self._beliefs:
-            found += _of_beliefs(self._beliefs, beliefs, state, record.t_ns, settings)
+            found += _of_beliefs(self._beliefs, beliefs, state)
             self._beliefs = beliefs
         for name, scatter in state.scatter.items():
             if scatter.noisy != self._scatter.get(name, False):
@@ -109,11 +109,14 @@ class Changes:
             imu = s.strap.why or f"no new sample for {(t_ns - s.imu_ns) * 1e-9:.0f} s"
         if uses("air_data") and s.pitot_ns > 0 and s.ground.flying and not s.landed:
             pitot, is_false = _why_no_airspeed(s, self._stuck, t_ns)
-        is_used = t_ns - s.pitot_ns <= SILENT_NS["air"]
+        is_silent = t_ns - s.pitot_ns > SILENT_NS["air"]
+        # read and held false: it is not used, though an autopilot without GNSS may have begun to use it again
+        is_excluded = not is_silent and self._beliefs[AIRSPEED : AIRSPEED + 1] == (EXCLUDED,)
+        is_used = not is_silent and not is_excluded
         found = self._imu.update(not s.is_silent("imu", t_ns), imu, t_ns) + self._pitot.update(
-            is_used, pitot, t_ns
+            is_used, pitot if is_silent else "", t_ns
         )
-        if not (is_false and self._pitot.is_reported(pitot)):
+        if not ((is_excluded and s.ground.flying) or (is_false and self._pitot.is_reported(pitot))):
             self._is_advised = self._is_advised and not is_used
         elif not self._is_advised and not sources(state, t_ns, settings) & Source.GNSS:
             self._is_advised = True
@@ -162,9 +165,7 @@ def _announced(before: tuple[int, ...], now: tuple[int, ...]) -> tuple[int, ...]
     return (*now[:VELOCITY], before[VELOCITY], *now[VELOCITY + 1 :])
 
 
-def _of_beliefs(
-    before: tuple[int, ...], after: tuple[int, ...], state: State, t_ns: int, settings: Settings
-) -> list[tuple[Severity, str]]:
+def _of_beliefs(before: tuple[int, ...], after: tuple[int, ...], state: State) -> list[tuple[Severity, str]]:
     found: list[tuple[Severity, str]] = []
     for i, (now, p) in enumerate(zip(after, state.false, strict=True)):
         if now == (before[i] if i < len(before) else 0):
@@ -176,9 +177,6 @@ def _of_beliefs(
         }[now]
         severity = Severity.WARNING if now else Severity.NOTICE
         found.append((severity, f"{source_name(i, state)} {text}"))
-        by_gnss = sources(state, t_ns, settings) & Source.GNSS
-        if i == AIRSPEED and now == EXCLUDED and not by_gnss:
-            found.append((Severity.WARNING, _advice(settings)))
     return found
 
 
