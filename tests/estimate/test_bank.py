@@ -518,6 +518,21 @@ def flight_layout(grades=(1.0,)):
     return Layout(2, (1, 1), (Source("gnss", 1, 0), Source("beacon", 1, 1)), faults, grades=grades)
 
 
+def test_a_presumed_source_leads_while_it_is_received_and_not_excluded():
+    """Flown: GNSS, false at 0.98 after a jump, was lost, and the estimate stayed 300 m off by it."""
+    layout = scalar_layout()
+    layout = replace(layout, sources=(replace(layout.sources[0], presumed=True),))
+    bank = fly(layout, [0.0, 0.0, 20.0], EXHAUSTIVE)
+    is_false = (bank.fault != NONE).any(axis=1)
+    L = np.where(is_false, math.log(0.98 / is_false.sum()), math.log(0.02 / (~is_false).sum()))
+    received = b.decide(bank._replace(L=L, leading=0), layout)
+    assert not received.excluded[0]
+    assert received.leading == 0
+    silent = received._replace(t=received.t + layout.sources[0].silence_s + 1.0)
+    assert b.decide(silent, layout).leading != 0
+    assert b.decide(silent._replace(seen=np.array([silent.t])), layout).leading == 0  # it is back
+
+
 def test_nothing_is_excluded_for_ever():
     layout = flight_layout()
     settings = Settings(rows=32)

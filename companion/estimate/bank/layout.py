@@ -36,7 +36,8 @@ class Source:
     group, slot : where its lie stands: the group of lie states and the first offset in it. Two sources may
         share slots unless one fault concerns both.
     silence_s : a longer gap freezes the faults of this source; the next measurement is a return.
-    presumed : the estimate follows an explanation that holds it to be false only once it is excluded.
+    presumed : the estimate follows an explanation that holds it to be false only once it is excluded, or
+        silent.
     """
 
     name: str

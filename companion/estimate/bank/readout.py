@@ -49,7 +49,8 @@ def decide(bank: Bank, layout: Layout, settings: Settings = DEFAULT) -> Bank:
     excluded = np.where(bank.excluded, p >= settings.believed, p > settings.excluded)
     w, code = bank.weights, explanations(bank, layout)
     for s, source in enumerate(layout.sources):
-        if source.presumed and not excluded[s]:
+        is_silent = bank.t - bank.seen[s] > source.silence_s
+        if source.presumed and not excluded[s] and not is_silent:
             w[false_rows(bank, layout, s)] = 0.0
     totals: dict[int, float] = {}
     for c, v in zip(code.tolist(), w.tolist()):
