@@ -60,6 +60,8 @@ from companion.units import SECOND_NS
 
 GATE_SIGMA = 5.0
 MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
+#: The mean may be off by so much: 1 m at a latency of 0.35 s. With 42 m/s the position was 16 m off.
+MEAN_OFF_M_S = 3.0
 JUMPED_M = GATE_SIGMA * CHANNEL_JUMP_M  # within it a jump of the channel explains a fix
 #: One sigma of a position that begins at a beacon's answer: several times what its place may be off by.
 BEACON_FIRST_M = 10_000.0
@@ -168,12 +170,12 @@ def _latency_velocity(
     """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
 
     The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
-    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. By IMU it is the velocity
-    that GNSS states, if that is believed (`stated`). Else, and by airspeed where GNSS states none
-    (`is_measured`), it is the nominal velocity less a slow mean of its estimated error, which a wrong
-    accelerometer leaves behind: 1 m/s^2 put the position 16 m off a GNSS late by 0.35 s. A held velocity is
-    far off in every turn. After a silence the velocity must be that of the fix: 5 m/s off in the first of two
-    positions, they seemed to measure a latency of 0.13 s.
+    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. So does that of the
+    velocity that GNSS states. By IMU, and by airspeed where GNSS states no velocity (`is_measured`), the
+    nominal velocity is taken less a slow mean of its estimated error; a held velocity is far off in every
+    turn. A wrong accelerometer leaves the mean behind: it begins again where it is `MEAN_OFF_M_S` off the
+    velocity that GNSS states, if that is believed (`stated`). After a silence the velocity must be that of
+    the fix: 5 m/s off in the first of two positions, they seemed to measure a latency of 0.13 s.
     """
     v_n, by = estimated_velocity(state), driver(state)
     if by != "imu" and (is_measured or by not in ("air", "foreign")):
@@ -181,11 +183,12 @@ def _latency_velocity(
     assert state.nominal is not None
     nominal, mean = state.nominal.point.v_n, state.velocity_error
     north, east = nominal[0] - v_n[0], nominal[1] - v_n[1]
-    if stated is not None:  # a mean that is needed later begins at the last one
-        return structs.replace(state, velocity_error=VelocityError(t_ns, north, east)), stated
     if mean is not None:
         part = -math.expm1(-max(t_ns - mean.t_ns, 0) * 1e-9 / MEAN_S)
-        north, east = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
+        slow = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
+        smooth = nominal[0] - slow[0], nominal[1] - slow[1]
+        if stated is None or math.dist(smooth, stated) <= MEAN_OFF_M_S:
+            north, east = slow
     state = structs.replace(state, velocity_error=VelocityError(t_ns, north, east))
     return state, _smooth_velocity(state)
 
