@@ -92,7 +92,7 @@ class AutopilotOutput:
         elif isinstance(record, GlobalPosition | FilterStatus):
             self._position_reset.receive(record)
             if isinstance(record, GlobalPosition):
-                self._source_switch.receive(record)
+                self._source_switch.note_own(record)
         elif isinstance(record, RsbnFix):
             sigma_azimuth, sigma_range = beacon_sigmas(record, self.config.rsbn)
             self._source_switch.receive(

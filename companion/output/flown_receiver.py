@@ -1,19 +1,25 @@
 """Which of two GNSS receivers the autopilot flies by, judged by its own position. No I/O.
 
-An autopilot with two receivers chooses by itself (ArduPilot: `GPS_AUTO_SWITCH`); the navigator judges one.
-Flown: the first receiver drawn off at 2 m/s, ArduPlane 0.7 m off by the second, and it was taken off GNSS.
+An autopilot with two receivers chooses by itself (ArduPilot: `GPS_AUTO_SWITCH`), and the navigator judges
+one. Flown on ArduPlane: the first receiver was drawn off at 2 m/s, the autopilot flew by the second, 0.7 m
+off, and the companion requested source set 2. It needs GLOBAL_POSITION_INT, which is not requested beside an
+INS of its own.
 """
 
 from __future__ import annotations
 
+import math
+
 from companion.nav.geometry import Geodetic, displace
 from companion.output.gate import distance
-from companion.records import GlobalPosition, Gnss
+from companion.records import GlobalPosition, Gnss, Solution
 from companion.units import SECOND_NS
 
-APART_M = 15.0  # two receivers that are drawn off alike are nearer to each other
-SHARE = 0.25  # of the distance between the receivers, within which it flies by one of them
+MOST_M = 15.0  # from the other receiver; an autopilot that is further off blends the two
+SHARE = 0.25  # of its distance from the receiver in use, at most so far from the other
+LATE_S = 0.2  # fixes may be so late, the autopilot's own position is not
 RECENT_NS = 2 * SECOND_NS
+KEPT_NS = 10 * SECOND_NS  # a gap in the streams does not mean that it flies by the one in use
 
 
 class FlownReceiver:
@@ -23,29 +29,39 @@ class FlownReceiver:
         self._used: Gnss | None = None
         self._other: Gnss | None = None
         self._own: GlobalPosition | None = None
+        self._kept_ns = 0  # until when the last answer holds
 
-    def receive(self, record: Gnss | GlobalPosition, is_used: bool = True) -> None:
-        """Note the autopilot's position, or what a receiver reports: the one in use, or the other."""
-        if isinstance(record, GlobalPosition):
-            self._own = record
-        elif is_used:
-            self._used = record if record.has_3d_fix else None
-        else:
-            self._other = record if record.has_3d_fix else None
+    def note_used(self, record: Gnss) -> None:
+        """Note what the receiver in use reports."""
+        self._used = record if record.has_3d_fix else None
 
-    def is_other(self, now_ns: int) -> bool:
-        """Return whether the autopilot is where the other receiver is, and not the one in use."""
+    def note_other(self, record: Gnss) -> None:
+        """Note what the other receiver reports."""
+        self._other = record if record.has_3d_fix else None
+
+    def note_own(self, record: GlobalPosition) -> None:
+        """Note the autopilot's own position."""
+        self._own = record
+
+    def is_other(self, ours: Solution, now_ns: int) -> bool:
+        """Return whether the autopilot flies by the other receiver, or did within `KEPT_NS`.
+
+        The other one must be nearer to our position (`ours`) than to the one in use: both may be false.
+        """
         used, other, own = self._used, self._other, self._own
-        if used is None or other is None or own is None:
+        if other is None:  # it has no fix
             return False
-        if now_ns - min(used.rx_ns, other.rx_ns, own.rx_ns) > RECENT_NS:
-            return False
-        false, right, here = (_at(record, now_ns) for record in (used, other, own))
-        is_apart = distance(false, right) > APART_M
-        return is_apart and distance(here, right) < SHARE * distance(here, false)
+        if used is None or own is None or now_ns - min(r.rx_ns for r in (used, other, own)) > RECENT_NS:
+            return now_ns < self._kept_ns
+        at_used, at_other, at_own, at_ours = (_at(record, now_ns) for record in (used, other, own, ours))
+        off_m = distance(at_own, at_other) - LATE_S * math.hypot(*own.v_n[:2])
+        is_there = off_m < min(MOST_M, SHARE * distance(at_own, at_used))
+        if is_there and distance(at_other, at_ours) < 0.5 * distance(at_other, at_used):
+            self._kept_ns = now_ns + KEPT_NS
+        return now_ns < self._kept_ns
 
 
-def _at(record: Gnss | GlobalPosition, now_ns: int) -> Geodetic:
+def _at(record: Gnss | GlobalPosition | Solution, now_ns: int) -> Geodetic:
     """Return the position at `now_ns`, by its velocity."""
     north, east, _ = record.v_n or (0.0, 0.0, 0.0)
     dt = (now_ns - record.t_ns) * 1e-9

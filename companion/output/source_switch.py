@@ -2,10 +2,10 @@
 
 ArduPilot accepts a source set that has no data, and is then lost; and a companion that takes an aircraft
 off a healthy GNSS does harm. So set 2 (our position) is requested only while our position goes out, and
-only if the receiver itself has no fix, or GNSS is false by the posterior and a beacon contradicts it: never
-because innovations were rejected. Set 1 (GNSS) is requested whenever the receiver has a fix that is not
-held false, also when there is no solution. The command is repeated until it is acknowledged, as long as the
-table requires it.
+only if the receiver itself has no fix, or GNSS is false by the posterior, a beacon contradicts it and the
+autopilot does not fly by its other receiver: never because innovations were rejected. Set 1 (GNSS) is
+requested whenever the receiver has a fix that is not held false, also when there is no solution. The command
+is repeated until it is acknowledged, as long as the table requires it.
 
 A set that somebody else selected (the pilot's switch, a ground station) is left as it is: no set is requested
 until a person selects the one that the table requires at that time, or the autopilot reboots.
@@ -101,7 +101,7 @@ class Situation(NamedTuple):
     witness: bool  # a beacon is received and believed, and itself contradicts GNSS
     sent_s: float  # our position has gone out
     stopped_s: float  # our position has not gone out, after it did
-    by_other: bool = False  # the autopilot flies by a GNSS receiver that is not the one in use
+    by_other: bool = False  # the autopilot flies by a receiver that is not the one in use
 
 
 class Predicate(NamedTuple):
@@ -117,12 +117,13 @@ def is_held_false(s: Situation) -> bool:
     return s.gnss_false is not None and s.gnss_false > FALSE and s.witness and not s.by_other
 
 
-GNSS_LOST = Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost, using companion")
+USING = ", using companion"  # left out where a set is needed but not requested
+GNSS_LOST = Predicate("no fix", lambda s: s.no_fix_s >= NO_FIX_S, "GNSS is lost" + USING)
 #: Set 2 needs our position and one of these.
 TO_COMPANION = (
     GNSS_LOST,
-    Predicate("receiver silent", lambda s: s.silent_s >= SILENT_S, "GNSS receiver silent, using companion"),
-    Predicate("GNSS false", is_held_false, "GNSS is false, using companion"),
+    Predicate("receiver silent", lambda s: s.silent_s >= SILENT_S, "GNSS receiver silent" + USING),
+    Predicate("GNSS false", is_held_false, "GNSS is false" + USING),
 )
 #: Set 1 needs a fix and one of these.
 TO_GNSS = (
@@ -210,29 +211,30 @@ class SourceSwitch:
         self._asked_ns = 0  # when the receiver's message was last requested
         self._events: list[Event] = []
 
-    def receive(self, record: Gnss | GlobalPosition | RsbnFix) -> None:
-        """Note what the autopilot's receiver reports, the autopilot's own position, or a beacon.
+    def receive(self, record: Gnss | RsbnFix) -> None:
+        """Note what the autopilot's receiver reports, or a beacon.
 
         A repeated GNSS fix counts: the receiver still reports.
         """
-        if isinstance(record, GlobalPosition):
-            self._flown.receive(record)
-            return
         doubt = None if self._solution is None else self._solution.gnss_false
         self._witness.receive(record, is_believed=doubt is not None and doubt < BELIEVED)
         if isinstance(record, RsbnFix):
             return
         now = record.rx_ns
         self._receiver, self._receiver_ns = record.receiver, now
-        self._flown.receive(record)
+        self._flown.note_used(record)
         self._fix.update(record.has_3d_fix, now, 3 * SECOND_NS)
         self._no_fix.update(not record.has_3d_fix, now, 3 * SECOND_NS)
 
     def note_other(self, record: Gnss) -> None:
         """Note what a receiver reports that is not in use: with its fix the autopilot has GNSS."""
-        self._flown.receive(record, is_used=False)
+        self._flown.note_other(record)
         if record.has_3d_fix:
             self._other_fix_ns = record.rx_ns
+
+    def note_own(self, record: GlobalPosition) -> None:
+        """Note the autopilot's own position."""
+        self._flown.note_own(record)
 
     def note_output(self, solution: Solution, sent: bool, now_ns: int, period_ns: int = 0) -> None:
         """Note a solution and whether its position went out, one of those due every `period_ns`."""
@@ -261,13 +263,19 @@ class SourceSwitch:
             witness=fresh and solution is not None and solution.witness and self._witness.contradicts,
             sent_s=max(-1.0, sent_s),  # a single position of a slow output is not steady
             stopped_s=stopped_ns * 1e-9,
-            by_other=self._flown.is_other(now_ns),
+            by_other=self._flies_by_other(now_ns),
         )
 
     @property
     def is_on_companion(self) -> bool:
         """Whether our position leads: acknowledged by the autopilot, or selected by somebody else."""
         return self._leading == COMPANION_SET
+
+    def _flies_by_other(self, now_ns: int) -> bool:
+        """Whether the autopilot flies by a receiver that is not in use; on our position it flies by none."""
+        if self._solution is None or self.is_on_companion or COMPANION_SET in self._unconfirmed:
+            return False
+        return self._flown.is_other(self._solution, now_ns)
 
     @property
     def has_left_gnss(self) -> bool:
@@ -311,7 +319,7 @@ class SourceSwitch:
         self._required, self._reason = decision
         if self._held is not None:
             if is_new and self._required != self._held:
-                need = f"{self.name(self._required)} needed ({self._reason.partition(',')[0]})"
+                need = f"{self.name(self._required)} needed ({self._reason.removesuffix(USING)})"
                 text = f"{need}, but {self.name(self._held)} selected by hand"
                 self._add_event(Severity.WARNING, text, now_ns)
         elif self._required != self._wanted or self._is_again_due(now_ns):

@@ -104,6 +104,7 @@ situations = st.builds(
     witness=st.booleans(),
     sent_s=seconds,
     stopped_s=seconds,
+    by_other=st.booleans(),
 )
 
 
@@ -199,26 +200,55 @@ class Flight:
         return [source_set for _, source_set, _ in self.requests]
 
 
-@pytest.mark.parametrize(
-    ("other_m", "own_m", "requested"),
-    [(0.0, 2.0, [1]), (78.0, 79.0, [1, 2]), (0.0, 40.0, [1, 2]), (0.0, 80.0, [1, 2])],
-    ids=["it flies by the other", "both are drawn off alike", "it blends them", "it flies by the false one"],
-)
-def test_a_false_receiver_that_the_autopilot_does_not_fly_by_takes_it_off_no_gnss(
-    other_m: float, own_m: float, requested: list[int]
-) -> None:
+BY_OTHER = {
+    "it flies by the other": (80.0, 0.0, 2.0, [1]),
+    "the two are near": (12.0, 0.0, 0.5, [1]),
+    "both are drawn off alike": (80.0, 78.0, 79.0, [1, 2]),
+    "both are false": (80.0, -300.0, -300.0, [1, 2]),
+    "it blends them": (2000.0, 0.0, 300.0, [1, 2]),
+    "it flies by the false one": (80.0, 0.0, 80.0, [1, 2]),
+}
+
+
+def fly_two(flight: Flight, seconds: int, used_m: float, other_m: float, own_m: float, **how: Any) -> None:
+    """Fly with two receivers and the autopilot so far east; the first is false."""
+    flight.drawn_m = used_m
+    for _ in range(seconds):
+        now = flight.now
+        lat, lon, alt = displace(1.0, 0.5, 100.0, 0.0, other_m, 0.0)
+        flight.switch.note_other(Gnss(now, now, 1, now // 1000, 3, lat, lon, alt))
+        lat, lon, alt = displace(1.0, 0.5, 100.0, 0.0, own_m, 0.0)
+        flight.switch.note_own(GlobalPosition(now, now, lat, lon, alt, (0.0, 0.0, 0.0), 0.0))
+        flight.fly(1.0, false=0.9999, **how)
+
+
+@pytest.mark.parametrize("case", BY_OTHER)
+def test_a_false_receiver_takes_off_no_autopilot_that_flies_by_the_other(case: str) -> None:
     """Flown (GPS_AUTO_SWITCH 1): the first receiver 80 m off, the autopilot 1 m off by the second one."""
+    used_m, other_m, own_m, requested = BY_OTHER[case]
     flight = Flight()
     flight.fly(20.0)
-    for _ in range(40):
-        place, now = displace(1.0, 0.5, 100.0, 0.0, 80.0, 0.0), flight.now
-        lat, lon, alt = displace(*place, 0.0, other_m - 80.0, 0.0)
-        flight.switch.note_other(Gnss(now, now, 1, now // 1000, 3, lat, lon, alt))
-        lat, lon, alt = displace(*place, 0.0, own_m - 80.0, 0.0)
-        flight.switch.receive(GlobalPosition(now, now, lat, lon, alt, (0.0, 0.0, 0.0), 0.0))
-        flight.drawn_m = 80.0
-        flight.fly(1.0, false=0.9999)
+    fly_two(flight, 40, used_m, other_m, own_m)
     assert flight.sets == requested
+
+
+def test_a_gap_in_the_streams_takes_no_autopilot_off_its_other_receiver() -> None:
+    flight = Flight()
+    flight.fly(20.0)
+    fly_two(flight, 30, 80.0, 0.0, 1.0)
+    flight.fly(8.0, false=0.9999)  # nothing of the other receiver, and no position
+    fly_two(flight, 30, 80.0, 0.0, 1.0)
+    assert flight.sets == [1]
+
+
+def test_on_our_position_the_autopilot_flies_by_no_receiver() -> None:
+    """It was on the false one: once our position stops it does not go back, though it is at the other one."""
+    flight = Flight()
+    flight.fly(20.0)
+    fly_two(flight, 30, 80.0, 0.0, 80.0)
+    fly_two(flight, 30, 80.0, 0.0, 1.0)
+    fly_two(flight, 8, 80.0, 0.0, 1.0, sent=False)
+    assert flight.sets == [1, 2]
 
 
 def test_set_2_on_gnss_loss_and_set_1_on_its_return() -> None:
