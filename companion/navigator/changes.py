@@ -110,7 +110,7 @@ class Changes:
         if uses("air_data") and s.pitot_ns > 0 and s.ground.flying and not s.landed:
             pitot, is_false = _why_no_airspeed(s, self._stuck, t_ns)
         is_silent = t_ns - s.pitot_ns > SILENT_NS["air"]
-        # read and held false: it is not used, though an autopilot without GNSS may have begun to use it again
+        # excluded, it is not used again: without GNSS ArduPilot switches a failed sensor on
         is_excluded = not is_silent and self._beliefs[AIRSPEED : AIRSPEED + 1] == (EXCLUDED,)
         is_used = not is_silent and not is_excluded
         found = self._imu.update(not s.is_silent("imu", t_ns), imu, t_ns) + self._pitot.update(

@@ -37,7 +37,7 @@ class Source:
         share slots unless one fault concerns both.
     silence_s : a longer gap freezes the faults of this source; the next measurement is a return.
     presumed : the estimate follows an explanation that holds it to be false only once it is excluded, or
-        silent.
+        silent for longer than `silence_s`.
     """
 
     name: str

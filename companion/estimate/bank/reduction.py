@@ -111,7 +111,7 @@ def _listed(bank: Bank, layout: Layout, settings: Settings) -> _Rows:
 def _ranks(rows: _Rows, layout: Layout, settings: Settings) -> list[int]:
     """Return the rank of each row by its class, family, grade and jump; the lowest are kept."""
     order, keys, logs, active = rows.order, rows.keys, rows.logs, rows.active
-    # of what is written to a dict last remains: of the rows from the lightest on, the heaviest
+    # a later entry of a dict replaces an earlier one: of each key the heaviest row remains, or the oldest
     lightest_first, family = order[::-1], [key.family for key in keys]
     youngest_first = sorted(order, key=rows.since.__getitem__)[::-1]
     rank = [OTHER] * len(keys)
