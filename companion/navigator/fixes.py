@@ -9,7 +9,14 @@ from msgspec import structs
 from companion.estimate import bank as banks
 from companion.estimate.bank.settings import DEFAULT as THRESHOLDS
 from companion.estimate.fusion import Azimuth
-from companion.navigator import fix_observations, height_error, measurements, own_channel, scatter
+from companion.navigator import (
+    fix_observations,
+    height_error,
+    latency_velocity,
+    measurements,
+    own_channel,
+    scatter,
+)
 from companion.navigator.hypotheses import CHANNEL_JUMP_M, GNSS, MOST_BEACONS, POSITION, VELOCITY
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.own_error_model import HELD
@@ -17,7 +24,6 @@ from companion.navigator.progress import (
     carried,
     decided,
     driver,
-    estimated_velocity,
     is_silent,
     nearer,
     propagated,
@@ -32,7 +38,6 @@ from companion.navigator.state import (
     Settings,
     State,
     Step,
-    VelocityError,
     afresh,
     corrected,
     estimate,
@@ -54,14 +59,10 @@ from companion.records import (
     Severity,
     Source,
     Stamped,
-    Vector2,
 )
 from companion.units import SECOND_NS
 
 GATE_SIGMA = 5.0
-MEAN_S = 60.0  # of the estimated velocity error, for GNSS latency
-#: The mean may be off by so much: 1 m at a latency of 0.35 s. With 42 m/s the position was 16 m off.
-MEAN_OFF_M_S = 3.0
 JUMPED_M = GATE_SIGMA * CHANNEL_JUMP_M  # within it a jump of the channel explains a fix
 #: One sigma of a position that begins at a beacon's answer: several times what its place may be off by.
 BEACON_FIRST_M = 10_000.0
@@ -106,7 +107,7 @@ def gnss(state: State, record: Gnss, settings: Settings) -> Step:
         velocity is not None and velocity.accepted and not (state.reported and state.reported[VELOCITY])
     )
     stated = record.v_n[:2] if record.v_n is not None and is_believed else None
-    state, v_n = _latency_velocity(structs.replace(state, bank=bank), record.t_ns, is_measured, stated)
+    state, v_n = latency_velocity.of_gnss(structs.replace(state, bank=bank), record.t_ns, is_measured, stated)
     shows_latency = is_measured or driver(state) not in HELD
     taken = measurements.gnss_position(bank, known, channel, apart, factor * variance, v_n, shows_latency)
     restarted = list[Output]()
@@ -164,44 +165,6 @@ def _believed(state: State, record: Gnss, settings: Settings) -> Step:
     return state, out
 
 
-def _latency_velocity(
-    state: State, t_ns: int, is_measured: bool, stated: Vector2 | None
-) -> tuple[State, Vector2]:
-    """Return the velocity that GNSS latency multiplies in a position, north and east, m/s.
-
-    The noise of the estimated velocity is also in the estimated position: as a coefficient it made straight
-    flight seem to measure the latency, as 0.08 s after ten minutes where it was 0. So does that of the
-    velocity that GNSS states. By IMU, and by airspeed where GNSS states no velocity (`is_measured`), the
-    nominal velocity is taken less a slow mean of its estimated error; a held velocity is far off in every
-    turn. A wrong accelerometer leaves the mean behind: it begins again where it is `MEAN_OFF_M_S` off the
-    velocity that GNSS states, if that is believed (`stated`). After a silence the velocity must be that of
-    the fix: 5 m/s off in the first of two positions, they seemed to measure a latency of 0.13 s.
-    """
-    v_n, by = estimated_velocity(state), driver(state)
-    if by != "imu" and (is_measured or by not in ("air", "foreign")):
-        return structs.replace(state, velocity_error=None), v_n
-    assert state.nominal is not None
-    nominal, mean = state.nominal.point.v_n, state.velocity_error
-    north, east = nominal[0] - v_n[0], nominal[1] - v_n[1]
-    if mean is not None:
-        part = -math.expm1(-max(t_ns - mean.t_ns, 0) * 1e-9 / MEAN_S)
-        slow = mean.north + part * (north - mean.north), mean.east + part * (east - mean.east)
-        smooth = nominal[0] - slow[0], nominal[1] - slow[1]
-        if stated is None or math.dist(smooth, stated) <= MEAN_OFF_M_S:
-            north, east = slow
-    state = structs.replace(state, velocity_error=VelocityError(t_ns, north, east))
-    return state, _smooth_velocity(state)
-
-
-def _smooth_velocity(state: State) -> Vector2:
-    """The nominal velocity less the slow mean of its error, if there is one; else the estimated one, m/s."""
-    mean = state.velocity_error
-    if mean is None or state.nominal is None:
-        return estimated_velocity(state)
-    north, east, _ = state.nominal.point.v_n
-    return north - mean.north, east - mean.east
-
-
 def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     """Use a beacon's answer: azimuth and slant range are measurements of the bank.
 
@@ -220,7 +183,7 @@ def rsbn(state: State, record: RsbnFix, settings: Settings) -> Step:
     assert nominal is not None
     assert state.bank is not None
     point, centre = corrected(nominal.point, state, settings)
-    point = point._replace(v_n=(*_smooth_velocity(state), point.v_n[2]))
+    point = point._replace(v_n=(*latency_velocity.smoothed(state), point.v_n[2]))
     known = hypotheses(state, settings)
     measured = accepted = believed = Source(0)
     height = settings.config.inertial.height_sigma_m

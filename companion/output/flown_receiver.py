@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 
-from companion.nav.geometry import Geodetic, displace
-from companion.output.gate import distance
+from companion.output.gate import distance, place_at
 from companion.records import GlobalPosition, Gnss, Solution
 from companion.units import SECOND_NS
 
@@ -53,16 +52,9 @@ class FlownReceiver:
             return False
         if used is None or own is None or now_ns - min(r.rx_ns for r in (used, other, own)) > RECENT_NS:
             return now_ns < self._kept_ns
-        at_used, at_other, at_own, at_ours = (_at(record, now_ns) for record in (used, other, own, ours))
+        at_used, at_other, at_own, at_ours = (place_at(record, now_ns) for record in (used, other, own, ours))
         off_m = distance(at_own, at_other) - LATE_S * math.hypot(*own.v_n[:2])
         is_there = off_m < min(MOST_M, SHARE * distance(at_own, at_used))
         if is_there and distance(at_other, at_ours) < 0.5 * distance(at_other, at_used):
             self._kept_ns = now_ns + KEPT_NS
         return now_ns < self._kept_ns
-
-
-def _at(record: Gnss | GlobalPosition | Solution, now_ns: int) -> Geodetic:
-    """Return the position at `now_ns`, by its velocity."""
-    north, east, _ = record.v_n or (0.0, 0.0, 0.0)
-    dt = (now_ns - record.t_ns) * 1e-9
-    return displace(record.lat, record.lon, record.alt_msl, north * dt, east * dt, 0.0)

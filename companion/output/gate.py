@@ -36,7 +36,7 @@ from typing import NamedTuple
 from companion.estimate.bank.settings import DEFAULT
 from companion.link.dialect import Message
 from companion.nav.geometry import Geodetic, displace, separation, wrap_angle
-from companion.records import Event, Mode, Severity, Solution, Trust, Vector2, Vector3
+from companion.records import Event, GlobalPosition, Gnss, Mode, Severity, Solution, Trust, Vector2, Vector3
 from companion.units import SECOND_NS
 
 MAX_AGE_S = 1.0
@@ -247,6 +247,13 @@ class LocalFrame:
                 return "local coordinates moved otherwise than the position"
         self._last = position, message
         return None
+
+
+def place_at(record: Gnss | GlobalPosition | Solution, t_ns: int) -> Geodetic:
+    """Return the position of a record at `t_ns`, by its velocity."""
+    north, east, _ = record.v_n or (0.0, 0.0, 0.0)
+    dt = (t_ns - record.t_ns) * 1e-9
+    return displace(record.lat, record.lon, record.alt_msl, north * dt, east * dt, 0.0)
 
 
 def distance(a: Geodetic, b: Geodetic) -> float:

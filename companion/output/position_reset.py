@@ -10,8 +10,8 @@ sigmas indicates a fault of ours: the reset is withheld.
 from __future__ import annotations
 
 from companion.link.dialect import entry_name, mavlink
-from companion.nav.geometry import Geodetic, displace
-from companion.output.gate import JUMP_MARGIN_M, SIGMAS, Position, distance
+from companion.nav.geometry import Geodetic
+from companion.output.gate import JUMP_MARGIN_M, SIGMAS, Position, distance, place_at
 from companion.records import Event, FilterStatus, GlobalPosition, Gnss, Severity, Stamped
 from companion.units import SECOND_NS
 
@@ -48,8 +48,7 @@ class PositionReset:
         own = self._autopilot_position
         if own is None or now_ns - own.rx_ns > POSITION_TIMEOUT_NS:
             return None
-        dt = (now_ns - own.t_ns) * 1e-9
-        return displace(own.lat, own.lon, own.alt_msl, own.v_n[0] * dt, own.v_n[1] * dt, 0.0)
+        return place_at(own, now_ns)
 
     def withholding_reason(self, position: Position) -> str | None:
         """Return why `position` must not be sent now; None if it may be sent."""

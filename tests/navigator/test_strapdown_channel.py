@@ -1105,7 +1105,7 @@ def test_a_wrong_accelerometer_does_not_turn_the_latency_of_gnss_into_an_offset(
     """A copter to and fro for a minute, which shows that GNSS is 0.35 s late, then a hover.
 
     The velocity that the latency multiplies was a mean of a minute, 42 m/s off by then, and the position 16 m
-    off a perfect GNSS. Four recorded copters were 4 to 7 m off, by 1 to 3 m now.
+    off a perfect GNSS. Four recorded copters were 3 to 7 m off, now 1 to 3 m.
     """
     rng = np.random.default_rng(0)
     start, late_s, bias, hovers_s = Geodetic(0.8, 0.15, 100.0), 0.35, 1.0, 60.0
