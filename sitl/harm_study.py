@@ -1,7 +1,7 @@
 """`companion study harm`: does the companion do harm while GNSS is healthy?
 
     companion study harm --quick
-    companion study harm --seeds 3 --minutes 10 --data ../shared/data
+    companion study harm --results logs/harm    # keeps every flight: an interrupted study continues
 
 Simulated flights with a healthy GNSS and one thing wrong, on every inertial channel that it concerns; then
 the recordings, where they are there (`sitl.harm_recordings`). A flight passes if GNSS is never excluded, EKF
@@ -16,8 +16,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -28,6 +27,9 @@ from msgspec.structs import replace
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from companion.analysis.jobs import Journal, run_jobs
+from companion.analysis.progress import show_count
+from companion.analysis.worker_options import worker_options
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.nav.geometry import displace
 from companion.option_types import FloatRange
@@ -36,6 +38,7 @@ from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.tables import number_table, print_tables
 from companion.units import SECOND_NS, Floats
+from companion.write_errors import make_folder
 from sitl import loopback
 from sitl.autopilot import SimulatedAutopilot
 from sitl.campaign.flight import sensors_of
@@ -46,8 +49,8 @@ from sitl.scenarios import EAST_BEACON, TAKE_OFF, WIND, Scenario, SensorRates
 from sitl.sensors import STATED_GRADES
 from sitl.world import World
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+Job = TypeVar("Job")
+Result = TypeVar("Result", "HarmResult", RecordingResult)
 
 START_S = 120.0  # something goes wrong from here on, unless it is wrong from the start
 GNSS_NOISE_M = 0.8  # white noise of the simulated receiver, one sigma per axis
@@ -131,6 +134,11 @@ class HarmOrder(NamedTuple):
     seed: int
     minutes: float
 
+    @property
+    def key(self) -> str:
+        """Name of the flight in the results folder."""
+        return f"{self.wrong}/{self.channel}/{self.seed}/{self.minutes:g}"
+
 
 class HarmResult(NamedTuple):
     """What was seen on one flight; `ratio` as in `worst_ratio`, None without solutions.
@@ -146,7 +154,7 @@ class HarmResult(NamedTuple):
     set_2: bool
     ratio: float | None
     since: float | None = None
-    suspected: tuple[str, ...] = ()
+    suspected: Sequence[str] = ()
     raised: str | None = None
 
     @property
@@ -216,7 +224,7 @@ def fly(order: HarmOrder) -> HarmResult:
             set_2,
             ratio=worst_ratio(*_from(0.0, ours, its)),
             since=worst_ratio(*_from(START_S, ours, its)),
-            suspected=tuple(suspected),
+            suspected=suspected,
         )
     except Exception as error:  # the study goes on and lists it
         return HarmResult(*order[:3], False, False, None, raised=f"{type(error).__name__}: {error}")
@@ -326,12 +334,43 @@ def list_orders(names: Iterable[str], channels: Iterable[str], seeds: int, minut
     ]
 
 
-def _mapped(function: Callable[[Item], Result], workers: int, items: Sequence[Item]) -> list[Result]:
-    """Map in `workers` processes, in this one with 0."""
-    if workers == 0:
-        return list(map(function, items))
-    with ProcessPoolExecutor(workers) as pool:
-        return list(pool.map(function, items))
+class Work(NamedTuple):
+    """Who works, and the journal of the results folder, if one is given."""
+
+    journal: Journal | None
+    scheduler: str | None
+    workers: int
+
+    def results(
+        self, work: Callable[[Job], Result], jobs: Mapping[str, Job], kind: type[Result], what: str
+    ) -> list[Result]:
+        """Return the result of each job: from the journal, or worked out now and kept there.
+
+        Raises ValueError if the journal has other results, or if one is lost with its worker.
+        """
+        found, lost = self._kept(jobs, kind), ""
+        todo = {key: job for key, job in jobs.items() if key not in found}
+        with show_count() as progress:
+            task = progress.add_task(what, total=len(jobs), completed=len(found))
+            for done in run_jobs(work, todo, self.scheduler, self.workers, "campaign"):
+                if done.failure:
+                    lost = f"{done.key}: {done.failure}"
+                    continue
+                found[done.key] = done.result
+                if self.journal is not None:
+                    self.journal.append({"key": done.key, "result": done.result._asdict()})
+                progress.update(task, advance=1, description=done.key)
+        if lost:
+            raise ValueError(f"{lost}: start again, with --results what is finished is kept")
+        return [found[key] for key in jobs]
+
+    def _kept(self, jobs: Mapping[str, Job], kind: type[Result]) -> dict[str, Result]:
+        if self.journal is None:
+            return {}
+        try:
+            return {e["key"]: kind(**e["result"]) for e in self.journal.entries if e["key"] in jobs}
+        except (KeyError, TypeError) as error:
+            raise self.journal.invalid(error) from None
 
 
 def fly_one_recording(data: Path, name: str) -> RecordingResult:
@@ -356,8 +395,12 @@ def fly_one_recording(data: Path, name: str) -> RecordingResult:
     help="Folder of the recordings; skipped where it is missing.",
 )
 @click.option(
-    "--workers", type=click.IntRange(0), default=2, show_default=True, help="Processes; 0: this one only."
+    "-o",
+    "--results",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder; what has a result in it is not flown again. Default: nothing is kept.",
 )
+@worker_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     seeds: int | None,
@@ -366,6 +409,8 @@ def command(
     names: tuple[str, ...],
     channels: tuple[str, ...],
     data: Path,
+    results: Path | None,
+    scheduler: str | None,
     workers: int,
     as_json: bool,
 ) -> None:
@@ -379,9 +424,16 @@ def command(
         seeds or (QUICK_SEEDS if quick else SEEDS),
         minutes or (QUICK_MINUTES if quick else MINUTES),
     )
-    flights = _mapped(fly, workers, orders)
     there = list_recordings(data) if data.is_dir() else []
-    recordings = _mapped(partial(fly_one_recording, data), workers, there)
+    try:
+        if results is not None:
+            make_folder(results)
+        work = Work(None if results is None else Journal(results / "harm.jsonl"), scheduler, workers)
+        flights = work.results(fly, {order.key: order for order in orders}, HarmResult, "flights")
+        fly_one = partial(fly_one_recording, data)
+        recordings = work.results(fly_one, {name: name for name in there}, RecordingResult, "recordings")
+    except ValueError as error:
+        raise SystemExit(f"companion: {error}") from None
     if as_json:
         rows = [result._asdict() | {"passed": result.passed} for result in flights]
         click.echo(json.dumps({"flights": rows, "recordings": [r._asdict() for r in recordings]}))

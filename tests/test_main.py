@@ -135,7 +135,7 @@ def test_a_seed_without_beacons_is_rejected() -> None:
 
 def test_a_number_of_workers_beside_a_scheduler_is_rejected() -> None:
     working = [c for c in commands().values() if has_option(c, "scheduler")]
-    assert {command.name for command in working} == {"fleet", "campaign"}
+    assert {command.name for command in working} == {"fleet", "campaign", "harm"}
     for command in working:
         folders = [str(CUT)] if command.name == "fleet" else []
         done = CliRunner().invoke(command, [*folders, "--workers", "0", "--scheduler", "127.0.0.1:8786"])

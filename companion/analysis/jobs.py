@@ -119,7 +119,11 @@ class Journal:
         try:
             self.entries = [dict(json.loads(line)) for line in whole.splitlines()]
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{path}: invalid result ({error}); choose another --results folder") from None
+            raise self.invalid(error) from None
+
+    def invalid(self, error: Exception) -> ValueError:
+        """Return the error that an entry of another kind is."""
+        return ValueError(f"{self.path}: invalid result ({error}); choose another --results folder")
 
     def append(self, entry: Mapping[str, Any]) -> None:
         """Write one entry."""

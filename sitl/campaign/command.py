@@ -92,9 +92,7 @@ def results_in(journal: Journal) -> list[FlightResult]:
     try:
         return [FlightResult(**entry) for entry in journal.entries]
     except TypeError as error:
-        raise ValueError(
-            f"{journal.path}: invalid result ({error}); choose another --results folder"
-        ) from None
+        raise journal.invalid(error) from None
 
 
 def fly_orders(todo: Sequence[FlightOrder], scheduler: str | None, workers: int) -> Iterator[FlightResult]:

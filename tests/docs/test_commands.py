@@ -33,7 +33,8 @@ PAGES = [
 #: Commands that are not run by this test, and why.
 NOT_RUN = {
     r"make (test|flights|loopback|lint|docs)": "a job of .ci/run",
-    r"make (kills|soak|fuzz|all-flights)|companion campaign": "takes minutes to hours: tests/sitl",
+    r"make (kills|soak|fuzz|all-flights)": "takes minutes to hours: tests/sitl",
+    r"companion (campaign|study harm)": "takes an hour: tests/sitl",
     r"git|python3 -m venv|venv/bin/pip|sudo|/opt/.*pip|systemctl|journalctl": "changes the system",
     r"deploy/debian/build": "takes minutes, and the network",
     r"mavproxy": "needs MAVProxy: tests/clients",

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from companion.analysis.jobs import FinishedJob
 from companion.config import Config
 from companion.records import Event, GlobalPosition, Gnss, Rejection, Solution
 from sitl import harm_study
@@ -17,6 +18,7 @@ from sitl.faults import Fault
 from sitl.harm_recordings import (
     LOGS,
     RecordingLog,
+    RecordingResult,
     Track,
     fly_log,
     judge_recording,
@@ -206,3 +208,42 @@ def test_what_is_given_beside_quick_is_used(options, seeds, minutes, tmp_path, m
     done = CliRunner().invoke(harm_study.command, [*options, *fixed])
     assert done.exit_code == 0, done.output
     assert flown == [HarmOrder("nothing", "stock", seed, minutes) for seed in range(1, seeds + 1)]
+
+
+def test_what_is_kept_is_not_flown_again(tmp_path, monkeypatch):
+    flown = []
+    monkeypatch.setattr(harm_study, "fly", lambda o: flown.append(o) or HarmResult(*o[:3], False, False, 0.5))
+    monkeypatch.setattr(harm_study, "list_recordings", lambda data: ["a"])
+    seen = RecordingResult("a", 60.0, 60, 0.0, 0.5, None, None, False, None, False, True)
+    monkeypatch.setattr(harm_study, "fly_one_recording", lambda data, name: flown.append(name) or seen)
+    fixed = ["--case", "nothing", "--channel", "stock", "--workers", "0", "--data", str(tmp_path), "--json"]
+    keep = [*fixed, "--results", str(tmp_path / "kept")]
+    printed = [CliRunner().invoke(harm_study.command, [*keep, "--seeds", n]).stdout for n in "1122"]
+    assert flown == [HarmOrder("nothing", "stock", 1, 10.0), "a", HarmOrder("nothing", "stock", 2, 10.0)]
+    assert printed[0] == printed[1] and printed[2] == printed[3]
+    CliRunner().invoke(harm_study.command, [*keep, "--minutes", "5", "--seeds", "1"])
+    assert flown[3:] == [HarmOrder("nothing", "stock", 1, 5.0)]  # another flight
+
+
+def test_results_of_another_study_are_rejected(tmp_path):
+    (tmp_path / "harm.jsonl").write_text('{"key": "nothing/stock/1/5", "result": {"detected_s": 3.0}}\n')
+    options = ["--quick", "--case", "nothing", "--channel", "stock", "--results", str(tmp_path)]
+    done = CliRunner().invoke(harm_study.command, [*options, "--workers", "0", "--data", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "harm.jsonl: invalid result" in done.output and "choose another --results folder" in done.output
+
+
+def test_a_flight_that_is_lost_with_its_worker_leaves_the_others_kept(tmp_path, monkeypatch):
+    def run(work, jobs, *_):
+        first, *others = jobs
+        return iter(
+            [FinishedJob(first, None, "worker lost"), *(FinishedJob(k, work(jobs[k])) for k in others)]
+        )
+
+    monkeypatch.setattr(harm_study, "run_jobs", run)
+    monkeypatch.setattr(harm_study, "fly", lambda o: HarmResult(*o[:3], False, False, 0.5))
+    options = ["--case", "nothing", "--channel", "stock", "--data", str(tmp_path / "none")]
+    done = CliRunner().invoke(harm_study.command, [*options, "--workers", "0", "--results", str(tmp_path)])
+    assert done.exit_code == 1 and "nothing/stock/1/10: worker lost: start again" in done.output
+    kept = [json.loads(line)["key"] for line in (tmp_path / "harm.jsonl").read_text().splitlines()]
+    assert kept == ["nothing/stock/2/10", "nothing/stock/3/10"]
