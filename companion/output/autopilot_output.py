@@ -28,6 +28,7 @@ from companion.output.gate import (
     distance,
 )
 from companion.output.gnss_fusion import GnssFusion
+from companion.output.own_position_monitor import OwnPositionMonitor
 from companion.output.position_reset import PositionReset
 from companion.output.source_switch import BELIEVED, STEADY_S, SourceSwitch
 from companion.records import (
@@ -65,7 +66,7 @@ class AutopilotOutput:
         self.unix_ns: int | None = None
         self._gate, self._local_frame, self._monitor = _gate(config), LocalFrame(), WithholdingMonitor()
         self._position_reset, self._source_switch = PositionReset(), _source_switch(config)
-        self._receivers = ReceiverChoice(config)
+        self._receivers, self._own_monitor = ReceiverChoice(config), OwnPositionMonitor()
         self._sending_ns = 0, 0  # since when without a gap, and when last, a position was sent
         self._events: list[Event] = []
 
@@ -121,7 +122,10 @@ class AutopilotOutput:
     def messages(self, solution: Solution, names: Collection[str], receiver: Receiver) -> list[Message]:
         """Return the messages among `names` that may be sent for `solution`, and the commands due."""
         now = solution.rx_ns
-        position = self._gate.admit(solution, self._position_reset.autopilot_place(now))
+        own = self._position_reset.autopilot_place(now)
+        position = self._gate.admit(solution, own)
+        if isinstance(position, Position) and not solution.contradicted:
+            self._add_event(self._own_monitor.update(own, position, lambda: self._why_far(now), now))
         encoded = dict[str, Message]()
         for name in names:
             reason = (
@@ -168,6 +172,16 @@ class AutopilotOutput:
         """Return the events since the last call."""
         taken, self._events = [*self._events, *self._source_switch.take_events()], []
         return taken
+
+    def _why_far(self, now_ns: int) -> str:
+        """Return what to look at where the autopilot's own position is far from ours."""
+        if self._source_switch.is_on_companion:
+            return "it does not follow ours"
+        situation = self._source_switch.situation(now_ns)
+        if situation.fix_s < 0.0:
+            return "it flies by neither GNSS nor ours"
+        is_doubted = (situation.gnss_false or 0.0) >= BELIEVED
+        return "it flies by a GNSS in doubt" if is_doubted else "it does not fly by the GNSS in use"
 
     def _rate_hz(self, name: str, position: Position, solution: Solution) -> float:
         """Return how often a position goes out as a measurement; 0 for one that is no part of a series."""

@@ -327,6 +327,28 @@ def test_a_position_that_was_not_sent_holds_no_later_one_back() -> None:
     assert [m.get_type() for m in output.messages(gnss, ["ODOMETRY"], known)] == ["ODOMETRY"]
 
 
+def test_an_autopilot_that_does_not_fly_by_the_gnss_in_use_is_reported_once() -> None:
+    """Flown: two blended receivers, the second drawn off; the autopilot 110 m off, ours 1 m, no report."""
+    flight, off_e7 = Flight(configured("output.profile=ardupilot")), 0
+
+    def displace_own(name: str, values: dict[str, Any]) -> None:
+        if name == "GLOBAL_POSITION_INT":
+            values["lat"] += off_e7
+
+    flight.falsify = displace_own
+    flight.fly(20.0)
+    off_e7 = 10_000  # 111 m
+    flight.fly(9.0)
+    assert not any("own position" in text for text in flight.texts)
+    flight.fly(30.0)
+    off_e7 = 0
+    flight.fly(20.0)
+    far, near = (text for text in flight.texts if "own position" in text)
+    assert far.startswith("autopilot's own position 11") and "it does not fly by the GNSS in use" in far
+    assert near.startswith("autopilot's own position ") and near.endswith(" m off ours again")
+    assert flight.source_set == 1
+
+
 LIVED_BY = {"ardupilot": (3, "ODOMETRY"), "px4": (12, "GLOBAL_POSITION_SENSOR")}
 
 
