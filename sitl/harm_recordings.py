@@ -27,7 +27,7 @@ from companion.link.dialect import mavlink
 from companion.navigator import Navigator, inertial_track
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import Receiver
-from companion.output.source_switch import COMPANION_SET
+from companion.output.source_table import COMPANION_SET
 from companion.records import (
     Attitude,
     Event,

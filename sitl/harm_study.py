@@ -33,7 +33,7 @@ from companion.analysis.worker_options import worker_options
 from companion.config import Config, InertialConfig, OutputConfig
 from companion.nav.geometry import displace
 from companion.option_types import FloatRange
-from companion.output.source_switch import SILENT_S
+from companion.output.source_table import SILENT_S
 from companion.records import Event, Gnss, RsbnFix, Solution, Stamped
 from companion.runtime.core import CompanionCore
 from companion.tables import number_table, print_tables

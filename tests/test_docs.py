@@ -16,7 +16,7 @@ from companion.link.decode import DECODED
 from companion.link.dialect import TYPES, rsbn, type_named
 from companion.link.parameter_server import parameter_table
 from companion.navigator import own_channel, own_error_model
-from companion.output import source_switch
+from companion.output import source_table
 from companion.output.gate import MAX_AGE_S, withholding_reason
 from companion.records import Trust
 from companion.runtime.links import requested_rates
@@ -172,13 +172,13 @@ def test_source_set_table_in_docs_has_the_times_of_the_code() -> None:
     seconds = {
         name: [float(x) for x in re.findall(r"\*\*([\d.]+) s\*\*", text)] for name, text in table.items()
     }
-    assert seconds["set 2"] == [source_switch.STEADY_S, source_switch.NO_FIX_S, source_switch.SILENT_S]
-    assert seconds["set 1"] == [source_switch.FIX_S, source_switch.STOPPED_S]
-    for name, predicates in (("set 2", source_switch.TO_COMPANION), ("set 1", source_switch.TO_GNSS)):
+    assert seconds["set 2"] == [source_table.STEADY_S, source_table.NO_FIX_S, source_table.SILENT_S]
+    assert seconds["set 1"] == [source_table.FIX_S, source_table.STOPPED_S]
+    for name, predicates in (("set 2", source_table.TO_COMPANION), ("set 1", source_table.TO_GNSS)):
         for predicate in predicates:
             assert f"EKF source {name}: {predicate.reason}" in table[name]
-    assert f"above {source_switch.FALSE}" in table["set 2"]
-    assert f"below {source_switch.BELIEVED}" in table["set 1"]
+    assert f"above {source_table.FALSE}" in table["set 2"]
+    assert f"below {source_table.BELIEVED}" in table["set 1"]
 
 
 def test_drivers_in_docs_are_those_of_the_own_channel() -> None:

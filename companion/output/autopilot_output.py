@@ -30,7 +30,8 @@ from companion.output.gate import (
 from companion.output.gnss_fusion import GnssFusion
 from companion.output.own_position_monitor import OwnPositionMonitor
 from companion.output.position_reset import PositionReset
-from companion.output.source_switch import BELIEVED, STEADY_S, SourceSwitch
+from companion.output.source_switch import SourceSwitch
+from companion.output.source_table import BELIEVED, STEADY_S
 from companion.records import (
     Event,
     FilterStatus,

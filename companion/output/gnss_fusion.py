@@ -19,16 +19,14 @@ from __future__ import annotations
 import math
 
 from companion.link.dialect import Message
-from companion.output.source_switch import (
+from companion.output.source_switch import REPORTS, Selected, SourceSwitch
+from companion.output.source_table import (
     COMPANION_SET,
     GNSS_LOST,
     GNSS_SET,
-    REPORTS,
     STEADY_S,
     TO_GNSS,
-    Selected,
     Situation,
-    SourceSwitch,
     is_held_false,
 )
 from companion.records import Severity

@@ -18,7 +18,7 @@ from companion.navigator.changes import FALSE_AIRSPEED, USE_AIRSPEED
 from companion.navigator.fixes import BEACON_REACH_M
 from companion.navigator.own_error_model import LATENCY
 from companion.output.gate import withholding_reason
-from companion.output.source_switch import BELIEVED
+from companion.output.source_table import BELIEVED
 from companion.records import (
     PARALLEL,
     AirData,

@@ -15,7 +15,7 @@ from companion.estimate import bank as banks
 from companion.navigator import Navigator
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.output.autopilot_output import AutopilotOutput
-from companion.output.source_switch import SILENT_S
+from companion.output.source_table import SILENT_S
 from companion.records import Attitude, Event, Gnss, Imu, LocalOrigin, Solution, Source
 from companion.units import G0, SECOND_NS
 

@@ -19,7 +19,7 @@ from companion.navigator import Navigator
 from companion.output.autopilot_output import AutopilotOutput
 from companion.output.encode import CORRELATION_S, ENCODERS, Receiver
 from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
-from companion.output.source_switch import Situation
+from companion.output.source_table import Situation
 from companion.records import (
     AirData,
     Event,

@@ -7,7 +7,8 @@ import pytest
 
 from companion.link import dialect
 from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
-from companion.output.source_switch import STEADY_S, Selected, Situation
+from companion.output.source_switch import Selected
+from companion.output.source_table import STEADY_S, Situation
 
 WELL = Situation(
     fix_s=1e3, no_fix_s=-1.0, silent_s=0.1, gnss_false=1e-6, witness=False, sent_s=1e3, stopped_s=0.0
