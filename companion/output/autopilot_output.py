@@ -69,6 +69,7 @@ class AutopilotOutput:
         self._position_reset, self._source_switch = PositionReset(), _source_switch(config)
         self._receivers, self._own_monitor = ReceiverChoice(config), OwnPositionMonitor()
         self._sending_ns = 0, 0  # since when without a gap, and when last, a position was sent
+        self._is_disarmed = False
         self._events: list[Event] = []
 
     @property
@@ -116,6 +117,7 @@ class AutopilotOutput:
         """Process a message of another sender that may concern what autopilot `system` fuses."""
         if from_autopilot and message.get_type() == "HEARTBEAT":
             is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self._is_disarmed = not is_armed
             self._source_switch.note_armed(is_armed)
         elif (by := self._source_switch.selected(message, from_autopilot, system)) is not None:
             self._source_switch.handle_selected(by, now_ns)
@@ -213,6 +215,8 @@ class AutopilotOutput:
 
     def _is_relied_on(self, now_ns: int) -> bool:
         """Return whether an autopilot may fly by what has been sent: then it goes on until it is decided."""
+        if self._is_disarmed:
+            return False
         first_ns, last_ns = self._sending_ns
         return now_ns - last_ns <= SENDING_GAP_NS and last_ns - first_ns >= STEADY_S * SECOND_NS
 

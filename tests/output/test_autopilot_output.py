@@ -16,7 +16,7 @@ from companion.link import dialect, frame
 from companion.link.fields import deg_e7
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
 from companion.navigator import Navigator
-from companion.output.autopilot_output import AutopilotOutput
+from companion.output.autopilot_output import DISPLAY_NAMES, AutopilotOutput
 from companion.output.encode import CORRELATION_S, ENCODERS, Receiver
 from companion.output.gnss_fusion import ESTIMATOR_SENSOR_ENABLE, GnssFusion
 from companion.output.source_table import Situation
@@ -81,6 +81,7 @@ class Flight:
         self.core, self.falsify, self.autopilot = CompanionCore(config, self.log, links), falsify, autopilot
         self.now, self.ticks = START, 0
         self.gnss = self.rsbn = True
+        self.armed = False
         self.source_set, self.answers = 1, True
         self.sent: list[tuple[float, Any]] = []
         self.payloads: list[Frame] = []
@@ -128,7 +129,7 @@ class Flight:
         place = self.place()
         here = {"lat": deg_e7(place.lat), "lon": deg_e7(place.lon)}
         if tick % 10 == 1:
-            self.send("HEARTBEAT", type=1, autopilot=self.autopilot)
+            self.send("HEARTBEAT", type=1, autopilot=self.autopilot, base_mode=128 if self.armed else 0)
             self.send("SYS_STATUS", **AIRSPEED_SENSOR)
             self.send("SYSTEM_TIME", time_unix_usec=(UTC_S * 10**9 + self.now - START) // 1000, **boot)
         if tick % 50 == 2:
@@ -361,7 +362,7 @@ def test_a_first_gnss_that_is_false_for_seconds_takes_no_autopilot_off_our_posit
     """It flies by a beacon. Where the position was withheld, set 1 was requested 2 s later, 22 km off."""
     autopilot, name = LIVED_BY[profile]
     flight = Flight(configured(f"output.profile={profile}"), autopilot)
-    flight.answers = case != "no answer"
+    flight.armed, flight.answers = True, case != "no answer"
     flight.fly(20.0, gnss=False)
     flight.falsify = displaced("GPS_RAW_INT", "lat", 0.2)
     for _ in range(3 if case == "three times" else 1):
@@ -376,6 +377,21 @@ def test_a_first_gnss_that_is_false_for_seconds_takes_no_autopilot_off_our_posit
         assert max(error for at, error, _ in odometry(flight) if at > 15.0) < 300.0
         assert HAS_FIX not in flight.texts
         assert flight.source_set == 2 or case == "no answer"
+
+
+@pytest.mark.parametrize("profile", LIVED_BY)
+def test_a_disarmed_autopilot_gets_no_position_that_its_first_gnss_contradicts(profile: str) -> None:
+    """Flown: PX4 on the ground beside a beacon 22 km off held that position for 17 s, armed and took off."""
+    autopilot, name = LIVED_BY[profile]
+    wrong_beacon = displaced("RSBN_MEASUREMENT", "beacon_lat", 0.2)
+    flight = Flight(configured(f"output.profile={profile}"), autopilot, wrong_beacon)
+    flight.fly(20.0, gnss=False)
+    assert flight.sent_messages(name, after=15.0)
+    flight.fly(9.0, gnss=True)
+    assert flight.sent_messages(name, after=20.5) == []
+    flight.fly(3.0)
+    assert flight.sent_messages(name, after=31.0)
+    assert f"{DISPLAY_NAMES.get(name, name)} withheld: GNSS contradicts it" in flight.texts
 
 
 @pytest.mark.flight
