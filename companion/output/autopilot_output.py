@@ -127,7 +127,7 @@ class AutopilotOutput:
         now = solution.rx_ns
         own = self._position_reset.autopilot_place(now)
         position = self._gate.admit(solution, own)
-        if isinstance(position, Position) and not solution.contradicted:
+        if isinstance(position, Position) and not (solution.contradicted or self.config.has_own_ins):
             self._add_event(self._own_monitor.update(own, position, lambda: self._why_far(now), now))
         encoded = dict[str, Message]()
         for name in names:

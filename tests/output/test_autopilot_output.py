@@ -328,21 +328,32 @@ def test_a_position_that_was_not_sent_holds_no_later_one_back() -> None:
     assert [m.get_type() for m in output.messages(gnss, ["ODOMETRY"], known)] == ["ODOMETRY"]
 
 
+def own_position_off(name: str, values: dict[str, Any]) -> None:
+    if name == "GLOBAL_POSITION_INT":
+        values["lat"] += 10_000  # 111 m
+
+
+def test_an_ins_of_its_own_that_drifts_is_no_position_of_the_autopilot() -> None:
+    config = configured(
+        "output.profile=ardupilot", "inertial.source=local_position", "inertial.independent=true"
+    )
+    flight = Flight(config)
+    flight.fly(20.0)
+    flight.falsify = own_position_off
+    flight.fly(30.0)
+    assert flight.sent_messages("ODOMETRY", after=45.0)
+    assert not any("own position" in text for text in flight.texts)
+
+
 def test_an_autopilot_that_does_not_fly_by_the_gnss_in_use_is_reported_once() -> None:
     """Flown: two blended receivers, the second drawn off; the autopilot 110 m off, ours 1 m, no report."""
-    flight, off_e7 = Flight(configured("output.profile=ardupilot")), 0
-
-    def displace_own(name: str, values: dict[str, Any]) -> None:
-        if name == "GLOBAL_POSITION_INT":
-            values["lat"] += off_e7
-
-    flight.falsify = displace_own
+    flight = Flight(configured("output.profile=ardupilot"))
     flight.fly(20.0)
-    off_e7 = 10_000  # 111 m
+    flight.falsify = own_position_off
     flight.fly(9.0)
     assert not any("own position" in text for text in flight.texts)
     flight.fly(30.0)
-    off_e7 = 0
+    flight.falsify = lambda name, values: None
     flight.fly(20.0)
     far, near = (text for text in flight.texts if "own position" in text)
     assert far.startswith("autopilot's own position 11") and "it does not fly by the GNSS in use" in far
