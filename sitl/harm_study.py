@@ -73,7 +73,7 @@ class Wrong(NamedTuple):
     stated: float = 1.0  # stated errors of the INS, as a multiple of the true ones
     noisy: type[Stamped] | None = None  # kind of fixes three times as noisy as stated
     rate_hz: float | None = None
-    feeds: bool = True  # a position is sent to the autopilot
+    feeds: bool = True  # a position is sent to the autopilot; else stock goes by its velocity
     stall_s: float = 0.0
     over_link: bool = False
 
@@ -98,7 +98,7 @@ WRONG: dict[str, Wrong] = {
     "INS 10x too fine": Wrong(INS, stated=0.1),
     "INS 10x too coarse": Wrong(INS, stated=10.0),
     "INS 100x too coarse": Wrong(INS, stated=100.0),
-    # of a foreign position the stock channel uses the velocity only: a jump changes nothing there
+    # of the autopilot's position the stock channel uses the velocity only: a jump changes nothing there
     "position jumps 100 m": Wrong(INS, _fault("ins-reset", 100.0), feeds=False),
     # not of an INS stated to be independent: its drift is the mirror image of a GNSS that is drawn off
     "position drifts 1 m/s": Wrong(("stock",), _fault("ins-drift", 1.0), feeds=False),
@@ -191,7 +191,8 @@ def config_of(order: HarmOrder) -> Config:
     """Return the default configuration of the channel, with what is stated wrongly."""
     wrong, output = WRONG[order.wrong], OutputConfig(profile="ardupilot")
     inertial = InertialConfig(
-        source="air_data" if order.channel == "air data" else "auto", independent=order.channel in INS
+        source="air_data" if order.channel == "air data" else "auto" if wrong.feeds else "local_position",
+        independent=order.channel in INS,
     )
     if wrong.stated != 1.0:
         true = STATED_GRADES["mems" if order.channel == "INS MEMS" else "navigation"]

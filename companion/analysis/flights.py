@@ -35,11 +35,8 @@ from companion.storage.run_metadata import run_metadata
 
 MAX_NS = 2**62
 OWN_INS = "local position of an INS of its own"
-SENSORS: dict[Sensor, str] = {
-    "imu": "IMU",
-    "air_data": "airspeed",
-    "local_position": "velocity, which may depend on that GNSS (see inertial.source)",
-}
+LOCAL_VELOCITY = "velocity of the autopilot's local position, which may depend on that GNSS"
+SENSORS: dict[Sensor, str] = {"imu": "IMU", "air_data": "airspeed"}
 
 
 def open_flights(path: Path, config: Config) -> list[Flight]:
@@ -90,17 +87,21 @@ def describe_channel(config: Config, sensors: Set[str]) -> str:
     """Describe what the inertial channel rests on: the `sensors` in the log that the configuration uses."""
     if config.has_own_ins and "local_position" in sensors:
         return f"The inertial channel is the {OWN_INS}."
-    used = [
-        name
-        for name in SENSORS
-        if name in sensors and config.uses(name) and (name == "local_position" or "attitude" in sensors)
-    ]
-    if config.has_own_ins or not used:
-        kept = "" if config.has_own_ins else " The last velocity is kept from fix to fix."
-        return f"The log has nothing for an inertial channel.{kept}"
-    *others, last = (["attitude"] if "attitude" in sensors else []) + [SENSORS[name] for name in used]
-    by = f"{', '.join(others)} and {last}" if others else last
-    return f"The inertial channel is the companion's own, by the autopilot's {by}."
+    if config.has_own_ins:
+        return "The log has nothing for an inertial channel."
+    if config.uses_local_velocity and "local_position" in sensors:
+        return f"The inertial channel is the {LOCAL_VELOCITY}."
+    used = [text for name, text in SENSORS.items() if name in sensors and config.uses(name)]
+    if used and "attitude" in sensors:
+        by = " and ".join(("attitude", *used)) if len(used) == 1 else "attitude, IMU and airspeed"
+        return f"The inertial channel is the companion's own, by the autopilot's {by}."
+    if "attitude" in sensors and config.uses("air_data"):
+        return (
+            "The log has no IMU and no sensor of airspeed: a fixed wing is taken to keep its airspeed, "
+            "anything else its velocity from fix to fix."
+        )
+    hint = " Give --with inertial.source=local_position to go by the autopilot's velocity."
+    return f"The log has nothing for an inertial channel.{hint if 'local_position' in sensors else ''}"
 
 
 def _sensor(record: Stamped) -> str | None:

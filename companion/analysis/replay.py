@@ -316,8 +316,7 @@ def _replay_changed(
     notes = [note] if note else []
     removed = log_inputs.outages.removed if log_inputs.outages is not None else {}
     without_gnss = any(number for outage, number in removed.items() if outage.source == "GNSS")
-    foreign_velocity = LocalPosition in kinds and config.uses("local_position") and not config.has_own_ins
-    if without_gnss and foreign_velocity:
+    if without_gnss and LocalPosition in kinds and config.uses_local_velocity:
         notes.append(
             "the velocity in the log's local position includes the effect of the autopilot's own GNSS during "
             "the outage"

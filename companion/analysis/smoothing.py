@@ -263,22 +263,18 @@ class _Path:
         before = self._settings
         config = self._with_gusts(parse(record.toml, "parameters in the log"))
         self._settings, state = tuned(self._state, before, config)
-        grade, is_wider = self._model.grade, self._settings.model.channel.n != before.model.channel.n
+        grade = self._model.grade
         if self._state.bank is not None and config.gnss.latency_s != before.config.gnss.latency_s:
             keep, variance = np.ones(len(self._Q)), np.zeros(len(self._Q))
             self._forget_receiver(keep, variance)
             self._Phi, self._Q = _forgotten(self._Phi, self._Q, keep, variance)
-        again = begins_again(before.config, config)
-        if again or is_wider:
+        if begins_again(before.config, config):  # the next run brings its grade
             self.end()
             self._close()
-        if again:  # the next run brings its grade
             grade = 0
         self._model = _PlainModel(self._settings.config, grade, len(self._beacons))
         self._settings = self._settings._replace(model=self._model)
         self._state = state if state.bank is not None else self._with_beacons(state)
-        if is_wider and state.bank is not None:
-            self._open()
 
     def _with_gusts(self, config: Config) -> Config:
         """With the gusts that the flight shows."""

@@ -59,9 +59,10 @@ TEXTS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "inertial": {
         "source": (
-            "Sensors that may be used: all, or only the one named. LOCAL_POSITION_NED is not used if a "
+            "Sensors that may be used: IMU and airspeed (auto), only the one named, or only the velocity of "
+            "LOCAL_POSITION_NED. The last depends on the autopilot's own GNSS, and cannot be used if a "
             "position is sent to the autopilot.",
-            "one of the sensors must not be used",
+            "one of the sensors must not be used, or a log has neither",
         ),
         "independent": (
             "LOCAL_POSITION_NED comes from an INS of its own that does not use our output. Never true for "

@@ -21,7 +21,7 @@ from companion.config.profiles import MESSAGES, PROFILES, Name, Via
 
 RateHz = Annotated[float, Meta(ge=0.0, le=400.0)]
 OutputHz = Annotated[float, Meta(ge=-1.0, le=50.0)]
-Sensor: TypeAlias = Literal["local_position", "air_data", "imu"]
+Sensor: TypeAlias = Literal["air_data", "imu"]
 NodeId = Annotated[int, Meta(ge=1, le=255)]
 HYPOTHESES_PER_JUMP = 22.5  # of the wind: by default the walk is that of a jump of 4 m/s an hour
 
@@ -54,11 +54,12 @@ class RatesConfig(Section, frozen=True):
 class InertialConfig(Section, frozen=True):
     """The sensors that may be used, and the error model of an INS of its own (one standard deviation each).
 
-    `source` "auto" allows all: "imu" (with the autopilot's attitude), "air_data" (airspeed and attitude) and
-    "local_position" (the velocity of LOCAL_POSITION_NED); any of these alone allows only that one. If a
-    position is sent to the autopilot, local position is not used. With `independent`, LOCAL_POSITION_NED
-    comes from an INS of its own that does not use our output, and that INS is corrected. The defaults of its
-    error model are those of a navigation-grade unit (0.01 deg/h, 50 ug).
+    `source` "auto" allows "imu" (with the autopilot's attitude) and "air_data" (airspeed and attitude); each
+    alone allows only that one. "local_position" is the velocity of LOCAL_POSITION_NED, which the autopilot's
+    estimator has from the same sensors and the same GNSS: it is used alone, and not if a position is sent to
+    the autopilot. With `independent`, LOCAL_POSITION_NED comes from an INS of its own that does not use our
+    output, and that INS is corrected. The defaults of its error model are those of a navigation-grade unit
+    (0.01 deg/h, 50 ug).
     """
 
     source: Literal["auto", "local_position", "air_data", "imu"] = "auto"
@@ -309,11 +310,11 @@ class Config(Section, frozen=True):
 
     @property
     def uses_local_velocity(self) -> bool:
-        """Whether the own channel may use the velocity of the autopilot's estimator; not if we feed that."""
-        return self.uses("local_position") and not self.output.feeds_estimator
+        """Whether the own channel goes by the velocity of the autopilot's estimator."""
+        return self.inertial.source == "local_position" and not self.has_own_ins
 
     def uses(self, sensor: Sensor) -> bool:
-        """Whether the own channel may use a sensor: `inertial.source` allows all or one."""
+        """Whether the own channel may use a sensor: `inertial.source` allows both or one."""
         return self.inertial.source in ("auto", sensor)
 
     @property

@@ -104,9 +104,6 @@ def check_airspeed(config: Config, healthy: bool | None, vehicle_type: int = 0) 
     by_drag = vehicle_type in MULTIROTORS and config.air_data.rotor_drag_per_s and config.uses("imu")
     if by_drag and not healthy:
         return [Finding("airspeed sensor", "none: by the drag of the rotors, in the air", "", None)]
-    others = [sensor for sensor in ("IMU",) if config.uses("imu")]
-    if config.uses_local_velocity:
-        others.append("local position")
     if healthy is None:
         text = "not reported: not used"
     elif healthy:
@@ -114,7 +111,7 @@ def check_airspeed(config: Config, healthy: bool | None, vehicle_type: int = 0) 
     elif vehicle_type in FIXED_WINGS:
         text = "none: taken for steady in the air"
     else:
-        text = f"none: reckoning by {' and '.join(others) or 'the last velocity'} only"
+        text = f"none: reckoning by {'IMU' if config.uses('imu') else 'the last velocity'} only"
     advice = "" if healthy else "without GNSS the wind cannot be separated from the error: add a sensor"
     return [Finding("airspeed sensor", text, "", None, advice)]
 

@@ -18,7 +18,7 @@ from msgspec import structs
 
 from companion.config import Config, ConfigError, parse
 from companion.estimate import bank as banks
-from companion.navigator import kept_state, minimax_bound, own_channel
+from companion.navigator import kept_state, minimax_bound
 from companion.navigator.bounded_trajectory import is_bound_due, refresh_bound, resolve_pending
 from companion.navigator.changes import Changes
 from companion.navigator.fixes import is_too_soon
@@ -26,7 +26,7 @@ from companion.navigator.hypotheses import Model
 from companion.navigator.measurements import other_receiver
 from companion.navigator.own_channel import OwnChannel
 from companion.navigator.past_states import PastStates
-from companion.navigator.progress import SILENT_INS_NS, births_due, propagated, with_births
+from companion.navigator.progress import SILENT_INS_NS, births_due, with_births
 from companion.navigator.receiver_choice import ReceiverChoice
 from companion.navigator.solution import solve
 from companion.navigator.stale_data import REPORT_EVERY, StaleDataDetector
@@ -434,29 +434,13 @@ def tuned(state: State, before: Settings, config: Config) -> tuple[Settings, Sta
     if begins_again(old, config):
         return settings, afresh(state)
     state = structs.replace(
-        _refitted(state, before, settings),
+        state,
         guarantee=minimax_bound.tuned(state.guarantee),
         parallel=state.parallel if config.estimator == old.estimator else None,
     )
     if config.gnss.latency_s != old.gnss.latency_s and state.bank is not None:
         state = structs.replace(state, bank=other_receiver(state.bank, settings.model.channel))
     return settings, state
-
-
-def _refitted(state: State, before: Settings, settings: Settings) -> State:
-    """With or without the states of the autopilot's velocity: it is used only while we do not feed it."""
-    channel, was = settings.model.channel, before.model.channel.n
-    if state.bank is None or state.nominal is None or channel.n == was:
-        return state
-    if state.nominal.driver == "foreign":
-        state = propagated(state, before)
-        assert state.nominal is not None
-        held = own_channel.restart(state.nominal, state.sensors.held, state.nominal.point.v_n[:2])
-        state = structs.replace(state, nominal=held)
-    assert state.bank is not None
-    first = min(channel.n, was)
-    bank = banks.exchange(state.bank, slice(first, was), channel.prior()[0].diagonal()[first:])
-    return structs.replace(state, bank=bank)
 
 
 def begins_again(old: Config, new: Config) -> bool:
@@ -485,7 +469,7 @@ def _channel_event(record: Input, settings: Settings) -> Event:
     if isinstance(settings.model.channel, OwnChannel):
         config = settings.config
         allowed: list[str] = [name for name in ("imu", "air_data") if config.uses(name)]
-        allowed += ["local_position"] * config.uses_local_velocity
+        allowed += ["velocity of the autopilot's local position"] * config.uses_local_velocity
         text = f"inertial channel: own, by what arrives of {', '.join(a.replace('_', ' ') for a in allowed)}"
         if "imu" in allowed:
             text += "; guaranteed bound by airspeed" if "air_data" in allowed else "; no guaranteed bound"

@@ -217,11 +217,6 @@ def rotor_drag(
     return _take(bank, known, seen_by, None, variance * np.eye(2), None, "velocity")
 
 
-def foreign_velocity(bank: Bank, known: Hypotheses, channel: OwnChannel, apart: Vector2) -> Taken:
-    """Take the velocity of the autopilot's own estimator; `apart` is nominal minus foreign (m/s)."""
-    return _velocity(bank, known, channel, own_error_model.foreign_row(channel.settings, apart))
-
-
 def standing(bank: Bank, known: Hypotheses, velocity: Vector2) -> Taken:
     """Take a nominal `velocity` (m/s) for the error: the aircraft stands."""
     H = np.zeros((2, known.layout.n_base))

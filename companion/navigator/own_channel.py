@@ -2,11 +2,12 @@
 
     imu      specific force turned by the autopilot's attitude, from 3.5 Hz up
     air      airspeed along the nose, where the aircraft flies; without a sensor, a steady one
-    foreign  velocity of the autopilot's estimator, where it is not fed by us
+    foreign  velocity of the autopilot's estimator, alone and only where it is asked for
     hold     the last velocity; hover: a multirotor's, which returns to zero
 
-Airspeed or a multirotor's drag beside the IMU, and the foreign velocity beside any, are measurements (see
-`own_error_model`). No position of the autopilot's is used, and no velocity of an estimator that we feed.
+Airspeed or a multirotor's drag beside the IMU are measurements (see `own_error_model`). No position of the
+autopilot's is used. Its velocity comes from the same sensors and GNSS: beside them it was no second witness,
+and once GNSS was lost its error, the wind's, was taken for motion.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from companion.navigator.inertial_track import Point
 from companion.navigator.own_error_model import By, Propagator
 from companion.navigator.standing import Standing
 from companion.navigator.strapdown_channel import Strap
-from companion.records import AirData, AirspeedSensor, Gnss, LocalPosition, RsbnFix, Vector2, Vector3
+from companion.records import AirData, AirspeedSensor, Gnss, RsbnFix, Vector2, Vector3
 from companion.units import G0, SECOND_NS, Floats
 
 #: A driver that is silent for longer hands over to the next.
@@ -87,7 +88,7 @@ class Wind(NamedTuple):
 
 
 class Sensors(Struct, frozen=True):
-    """Last readings: IMU and attitude, air data, the foreign velocity, and when each was last of use."""
+    """Last readings: IMU and attitude, air data, and when each driver was last of use."""
 
     strap: Strap = Strap()
     air: Reckoner = Reckoner()
@@ -97,7 +98,6 @@ class Sensors(Struct, frozen=True):
     pitot_ns: int = -SENSOR_NS  # when the airspeed of a sensor was last used
     winds: tuple[Wind, ...] = ()  # of the last half minute beside a pitot that was used
     steady: AirData | None = None  # the last airspeed that moved the position
-    foreign: LocalPosition | None = None
     imu_ns: int = -SENSOR_NS
     air_ns: int = -SENSOR_NS
     foreign_ns: int = -SENSOR_NS

@@ -523,12 +523,3 @@ def drag_rows(
     predicted = scale[:, None] * predicted - x[:, ACCELEROMETER] @ np.array(((c, s), (-s, c)))
     z: Floats = predicted - np.array(V) + np.einsum("rij,rj->ri", H, x[:, :N])
     return z, H
-
-
-def foreign_row(settings: Amplitudes, apart: Vector2) -> Row:
-    """Return the row of a foreign velocity: nominal minus foreign (m/s); not in intervals by `foreign`."""
-    H = np.zeros((2, N))
-    at = FOREIGN.start
-    H[0, 2] = H[1, 3] = 1.0
-    H[0, at] = H[1, at + 1] = -1.0
-    return Row(np.array(apart), H, np.eye(2) * settings.foreign_noise_m_s**2)

@@ -1,7 +1,7 @@
 """Samples of the own channel: attitude, pressure, IMU, airspeed and a foreign velocity.
 
-A sample moves the nominal trajectory if its sensor leads; else airspeed and foreign velocity are
-measurements. So is the drag in the IMU's samples of a multirotor.
+A sample moves the nominal trajectory if its sensor leads; else airspeed is a measurement. So is the drag in
+the IMU's samples of a multirotor.
 """
 
 from __future__ import annotations
@@ -52,7 +52,6 @@ from companion.navigator.state import (
     gnss_is_received,
     held_s,
     hypotheses,
-    own,
     with_sensors,
 )
 from companion.records import (
@@ -70,7 +69,6 @@ from companion.records import (
 )
 from companion.units import SECOND_NS
 
-FOREIGN_EVERY_NS = SECOND_NS
 TAKE_OFF_NS = 10 * SECOND_NS  # a multirotor is off the ground after it, at whatever height
 BLOCKED_M_S = 5.0  # slower, in flight, a pitot is blocked
 #: Between two samples, up to so far apart, no airspeed changes by more; one that did is not used for so long.
@@ -319,29 +317,11 @@ def _blocked_pitot(before: Sensors, record: AirData) -> list[Output]:
 
 
 def foreign_position(state: State, record: LocalPosition, settings: Settings) -> Step:
-    """Use the velocity of the autopilot's estimator, as driver or as measurement, where we do not feed it."""
-    s, config = state.sensors, settings.config
-    state = structs.replace(state, local=record)
+    """Go by the velocity of the autopilot's estimator."""
+    state = structs.replace(with_sensors(state, foreign_ns=record.t_ns), local=record)
     if state.origin is None and state.waiting_ns is None:
         state = structs.replace(state, waiting_ns=record.t_ns)
-    if not config.uses_local_velocity:
-        return state, []
-    before = s.foreign
-    state = with_sensors(state, foreign=record, foreign_ns=record.t_ns)
-    if state.nominal is None:
-        return state, []
-    velocity = (record.v_n[0], record.v_n[1])
-    if s.leads("foreign", record.t_ns):
-        return _driven(state, record, "foreign", velocity, settings)
-    if before is not None and record.t_ns // FOREIGN_EVERY_NS == before.t_ns // FOREIGN_EVERY_NS:
-        return state, []
-    state = propagated(carried(state, record.t_ns, settings), settings)
-    assert state.bank is not None
-    assert state.nominal is not None
-    v_n = state.nominal.point.v_n
-    apart = (v_n[0] - velocity[0], v_n[1] - velocity[1])
-    taken = measurements.foreign_velocity(state.bank, hypotheses(state, settings), own(settings), apart)
-    return decided(structs.replace(state, bank=taken.bank), record, settings), []
+    return _driven(state, record, "foreign", (record.v_n[0], record.v_n[1]), settings)
 
 
 def _driven(state: State, record: Stamped, by: By, sample: Vector2 | None, settings: Settings) -> Step:

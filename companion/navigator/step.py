@@ -121,9 +121,7 @@ _CORRECTORS: dict[str, _Uses] = {
     "stars": {StarFix: ins_samples.corrector("star")},
     "second_ins": {SecondIns: ins_samples.corrector("second INS")},
 }
-_OWN: _Uses = {
-    **_COMMON,
-    LocalPosition: own_samples.foreign_position,
+_OWN: _Uses = {kind: use for kind, use in _COMMON.items() if kind not in (LocalOrigin, GlobalPosition)} | {
     Attitude: own_samples.attitude,
     Pressure: own_samples.pressure,
     AirData: own_samples.air_data,
@@ -131,19 +129,18 @@ _OWN: _Uses = {
     Imu: own_samples.imu,
     Vehicle: own_samples.vehicle,
 }
-
-
-_ABOUT_LOCAL = (LocalPosition, GlobalPosition, LocalOrigin)
-_OWN_FED: _Uses = {kind: use for kind, use in _OWN.items() if kind not in _ABOUT_LOCAL}
-INPUTS_USED = tuple({*_INS, *_OWN, *(kind for use in _CORRECTORS.values() for kind in use), Tuning, Resumed})
+_OWN_BY_LOCAL: _Uses = {**_COMMON, **_OWN, LocalPosition: own_samples.foreign_position}
+INPUTS_USED = tuple(
+    {*_INS, *_OWN_BY_LOCAL, *(kind for use in _CORRECTORS.values() for kind in use), Tuning, Resumed}
+)
 """Kinds of records that a navigator may use."""
 
 
 def uses(settings: Settings) -> _Uses:
-    """What each kind of record is good for, by the channel; a local position that we feed is ignored."""
+    """What each kind of record is good for, by the channel; a local position only where it is asked for."""
     config = settings.config
     if not isinstance(settings.model.channel, OwnChannel):
         added = [_CORRECTORS[name] for name in config.inertial.correctors]
         return {kind: use for uses in (_INS, *added) for kind, use in uses.items()}
-    found = _OWN if config.uses_local_velocity else _OWN_FED
+    found = _OWN_BY_LOCAL if config.uses_local_velocity else _OWN
     return found if config.uses("imu") else {kind: use for kind, use in found.items() if kind is not Imu}

@@ -1,8 +1,8 @@
 """Report of an autopilot whose own position stays far from ours: it does not fly by what we believe. No I/O.
 
 Flown on ArduPlane with two blended receivers, the second drawn off: the autopilot was 110 m off, our position
-1 m, and nothing was reported. Nothing is sent for it and nothing withheld: a person has to look. Not used beside
-an INS of its own: what arrives there as the autopilot's position may be the INS's, which drifts.
+1 m, and nothing was reported. Nothing is sent for it and nothing withheld: a person has to look. Not used
+beside an INS of its own: what arrives there as the autopilot's position may be the INS's, which drifts.
 """
 
 from __future__ import annotations

@@ -1233,8 +1233,9 @@ def test_file_in_place_of_the_folder_of_figures_is_reported(log, tmp_path):
 
 def test_converted_log_is_reported_as_the_original(tmp_path):
     folder, log = Path(__file__).parents[1] / "data" / "umn_fixed_wing_cut", tmp_path / "umn.mcap"
-    convert_log(folder, log, Config())
-    (direct,), (converted,) = open_flights(folder, Config()), open_flights(log, Config())
+    config = load(flags={"inertial.source": "local_position"}, environment={})
+    convert_log(folder, log, config)
+    (direct,), (converted,) = open_flights(folder, config), open_flights(log, config)
     for name, table in direct.tables.items():
         for column in table:
             np.testing.assert_array_equal(converted.tables[name][column], table[column])
@@ -1251,13 +1252,22 @@ def test_converted_log_is_reported_as_the_original(tmp_path):
         (
             "attitude imu air_data local_position",
             {},
-            "by the autopilot's attitude, IMU, airspeed and velocity, which may depend on that GNSS",
+            "by the autopilot's attitude, IMU and airspeed.",
         ),
         ("attitude imu air_data", {"inertial.source": "imu"}, "by the autopilot's attitude and IMU."),
-        ("local_position", {}, "by the autopilot's velocity, which may depend"),
+        (
+            "local_position",
+            {},
+            "Give --with inertial.source=local_position to go by the autopilot's velocity.",
+        ),
+        (
+            "attitude imu local_position",
+            {"inertial.source": "local_position"},
+            "is the velocity of the autopilot's local position, which may depend on that GNSS.",
+        ),
         ("imu air_data", {}, "has nothing for an inertial channel."),
-        ("attitude", {}, "has nothing for an inertial channel."),
-        ("attitude", {}, "The last velocity is kept from fix to fix."),
+        ("attitude", {}, "no sensor of airspeed: a fixed wing is taken to keep its airspeed, anything else"),
+        ("attitude", {"inertial.source": "imu"}, "has nothing for an inertial channel."),
         ("attitude imu", {"inertial.independent": True}, "has nothing for an inertial channel."),
         ("local_position", {"inertial.independent": True}, "is the local position of an INS of its own."),
     ],

@@ -14,7 +14,7 @@ from companion.analysis import smoothing
 from companion.analysis.error_statistics import root_mean_square as rms
 from companion.analysis.first_pass import FirstPass
 from companion.analysis.smoothing import SmoothedRun, smooth_flight
-from companion.config import Config, GnssConfig, InertialConfig, load, to_toml
+from companion.config import Config, GnssConfig, InertialConfig, load
 from companion.nav.geometry import (
     Geodetic,
     displace,
@@ -38,8 +38,6 @@ from companion.records import (
     RsbnFix,
     Solution,
     TimeStep,
-    Truth,
-    Tuning,
     Vehicle,
 )
 from tests.recordings import recording
@@ -357,22 +355,6 @@ def test_reboot_starts_a_new_run() -> None:
     found = smooth_flight(records, CONFIG)
     (first,) = smooth_flight([r for r in flown.records if r.t_ns < cut], CONFIG)
     np.testing.assert_array_equal(found[0].x, first.x)
-
-
-def test_a_feed_that_is_switched_off_in_flight_does_not_end_the_track() -> None:
-    """From then on the velocity of the autopilot is used: two states more."""
-    fed, unfed = (
-        load(flags={"output.profile": "ardupilot", "output.odometry_hz": rate}, environment={})
-        for rate in (10.0, 0.0)
-    )
-    records = [r for r in recording("plane_take_off") if not isinstance(r, Truth)]
-    middle = records[len(records) // 2]
-    tuning = Tuning(middle.t_ns, middle.rx_ns, to_toml(unfed))
-    (plain,), (first, second) = smooth_flight(records, fed), smooth_flight([*records, tuning], fed)
-    assert abs(first.t_ns[-1] - second.t_ns[0]) < NS
-    assert second.t_ns[-1] > plain.t_ns[-1] - NS
-    north = (np.interp(second.t_ns, plain.t_ns, plain.lat) - second.lat) * 6.378e6
-    assert np.abs(north).max() < 3.0
 
 
 def test_a_step_of_time_widens_the_position_in_both_directions() -> None:

@@ -206,7 +206,7 @@ def test_unused_stream_may_be_missing(source: str, imu: bool | None, airspeed: b
     [
         (True, ["output.profile=ardupilot"], "healthy"),
         (False, ["output.profile=ardupilot"], "none: reckoning by IMU only"),
-        (False, ["output.profile=monitor"], "none: reckoning by IMU and local position only"),
+        (False, ["output.profile=monitor"], "none: reckoning by IMU only"),
         (None, ["output.profile=ardupilot"], "not reported: not used"),
     ],
 )

@@ -1075,19 +1075,6 @@ def test_renewed_states_are_as_before_the_first_measurement_and_the_others_keep_
     np.testing.assert_array_equal(after.L, bank.L)
 
 
-def test_exchanged_states_are_new_and_the_others_as_before():
-    _, bank = random_bank(5)
-    wider = b.exchange(bank, slice(2, 2), np.array([4.0, 9.0]))
-    old = [0, 1, *range(4, wider.x.shape[1])]
-    np.testing.assert_array_equal(wider.x[:, old], bank.x)
-    np.testing.assert_array_equal(wider.P[:, old][:, :, old], bank.P)
-    np.testing.assert_array_equal(wider.P[:, 2:4, 2:4], np.tile(np.diag([4.0, 9.0]), (len(bank.L), 1, 1)))
-    assert not wider.P[:, 2:4][:, :, old].any() and not wider.x[:, 2:4].any()
-    back = b.exchange(wider, slice(2, 4), np.array([]))
-    np.testing.assert_array_equal(back.x, bank.x)
-    np.testing.assert_array_equal(back.P, bank.P)
-
-
 def test_inflating_adds_variance_to_the_named_states_alone():
     _, bank = random_bank(6)
     after = b.inflate(bank, (0, 1), 3.0)

@@ -15,4 +15,4 @@ def test_a_sensor_that_may_not_be_used_is_not_read(source: str) -> None:
     config = Config(inertial=InertialConfig(source=source))  # type: ignore[arg-type]
     used = uses(Settings(config, Model(config)))
     assert (Imu in used) == (source in ("auto", "imu"))
-    assert (LocalPosition in used) == (source in ("auto", "local_position"))
+    assert (LocalPosition in used) == (source == "local_position")

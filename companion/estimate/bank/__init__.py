@@ -78,7 +78,6 @@ from companion.estimate.bank.settings import EXHAUSTIVE, Settings
 from companion.estimate.bank.state import (
     Bank,
     enlarge,
-    exchange,
     families,
     inflate,
     is_sound,
@@ -112,7 +111,6 @@ __all__ = [
     "enlarge",
     "estimate",
     "exceedance",
-    "exchange",
     "explanations",
     "false_probability",
     "false_since_first",

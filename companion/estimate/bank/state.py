@@ -221,27 +221,6 @@ def renew(bank: Bank, states: Sequence[int], sigma: Sequence[float]) -> Bank:
     return bank._replace(x=x, P=P)
 
 
-def exchange(bank: Bank, states: slice, variance: Floats) -> Bank:
-    """Replace some states of all rows by others: zero mean, independent.
-
-    Parameters
-    ----------
-    bank : the bank.
-    states : those that are left out; an empty slice only says where the others are put in.
-    variance : (k,) of the states that are put in.
-
-    Returns
-    -------
-    Bank : what is known of all other states, and the weights, are unchanged.
-    """
-    x, P = np.delete(bank.x, states, 1), np.delete(np.delete(bank.P, states, 1), states, 2)
-    at = np.full(len(variance), states.start)
-    x, P = np.insert(x, at, 0.0, 1), np.insert(np.insert(P, at, 0.0, 1), at, 0.0, 2)
-    added = at + np.arange(len(variance))
-    P[:, added, added] = variance
-    return bank._replace(x=x, P=P)
-
-
 def enlarge(bank: Bank, old: Layout, new: Layout, variance: Floats) -> Bank:
     """Add base states of the given variances, and the sources, faults and groups that `new` has beyond `old`.
 
