@@ -305,7 +305,9 @@ def command(
         f"{len(logs)} logs: {len(good)} flights of {hours:.1f} h, {len(rows) - len(good)} not readable"
     )
     for row in good[:5]:
-        worst = "no reference" if row.largest_m is None else f"largest error {row.largest_m:.1f} m"
+        worst = (
+            "no reference" if row.largest_m is None else f"at most {row.largest_m:.1f} m from {row.reference}"
+        )
         click.echo(f"  {printable(row.log)}: {row.verdict}, {worst}")
     for row in [row for row in rows if row.reason is not None][:5]:
         click.echo(f"  {printable(row.log)}: {printable(row.reason or '')}")

@@ -83,7 +83,7 @@ def open_flights(path: Path, config: Config) -> list[Flight]:
         return [replace(flight, remarks=(*flight.remarks, added)) for flight in flights]
 
 
-def describe_channel(config: Config, sensors: Set[str]) -> str:
+def describe_channel(config: Config, sensors: Set[str | None]) -> str:
     """Describe what the inertial channel rests on: the `sensors` in the log that the configuration uses."""
     if config.has_own_ins and "local_position" in sensors:
         return f"The inertial channel is the {OWN_INS}."
@@ -104,7 +104,7 @@ def describe_channel(config: Config, sensors: Set[str]) -> str:
     return f"The log has nothing for an inertial channel.{hint if 'local_position' in sensors else ''}"
 
 
-def _sensor(record: Stamped) -> str | None:
+def sensor_of(record: Stamped) -> str | None:
     """Return the name of the sensor that the record shows to be there, None if it shows none."""
     match record:
         case Imu():
@@ -132,7 +132,7 @@ def _run_navigator(
     """Yield records and outputs of the navigator, by topic; add the sensors of the log to `sensors`."""
     navigator = Navigator(config)
     for record in records:
-        if (sensor := _sensor(record)) is not None:
+        if (sensor := sensor_of(record)) is not None:
             sensors.add(sensor)
         yield flight_log.topic_of_input(record), record
         if isinstance(record, INPUTS):

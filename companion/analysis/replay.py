@@ -21,6 +21,7 @@ import click
 from companion.analysis import simulated_rsbn
 from companion.analysis.beacon_options import beacon_options
 from companion.analysis.comparison import TOLERANCE, OutputComparison
+from companion.analysis.flights import describe_channel, sensor_of
 from companion.analysis.output_guard import reject_other_flight, reject_own_input, remove_leftover
 from companion.analysis.progress import show_step
 from companion.analysis.replay_inputs import (
@@ -304,12 +305,14 @@ def _replay_changed(
     log_inputs, note = with_beacons_and_outages(log, beacons, outages, seed, config)
     log_inputs = with_correctors(log_inputs, tables)
     tracks, logged, kinds = gnss_latency.TrackCollector(), set[Stamped](), set[type[Stamped]]()
+    sensors = set[str | None]()
     described = derived_metadata(config, "replay", log)
     with (
         show_step(f"replay {log}"),
         create_replay_log(output, log, described) as sink,
     ):
-        found = replay_foreign(_observe(log_inputs.records, tracks, logged, kinds), config, sink)
+        records = _observe(log_inputs.records, tracks, logged, kinds, sensors)
+        found = replay_foreign(records, config, sink)
         analyses = [gnss_latency.analyze_track(track) for track in tracks.tracks()]
         for event in set(gnss_latency.glitch_events(analyses)) - logged:
             sink.record(event, "/link/Event")
@@ -332,6 +335,8 @@ def _replay_changed(
                 f"records of {name} have no effect: give --with inertial.independent=true,"
                 f"inertial.correctors={name}"
             )
+    if Solution.__name__ not in found.outputs:
+        notes.append(f"no estimate: {describe_channel(config, sensors)}")
     return found, [*notes, *gnss_latency.describe_analyses(analyses)], log_inputs.summary()
 
 
@@ -348,11 +353,13 @@ def _observe(
     tracks: gnss_latency.TrackCollector,
     logged: set[Stamped],
     kinds: set[type[Stamped]],
+    sensors: set[str | None],
 ) -> Iterator[Stamped]:
-    """Yield the records; collect the tracks of GNSS, the events and the kinds of record."""
+    """Yield the records; collect the tracks of GNSS, the events, the kinds of record and the sensors."""
     for record in records:
         tracks.add(record)
         kinds.add(type(record))
+        sensors.add(sensor_of(record))
         if isinstance(record, Event):
             logged.add(record)
         yield record

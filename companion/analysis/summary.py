@@ -101,7 +101,9 @@ def rms_after_start(a: Assessment, source: str) -> float | None:
 
 def _first_counted(a: Assessment, series: error_statistics.ErrorSeries) -> int:
     """Return the index of the first error that counts: not one of a start by beacons alone."""
-    first = int(np.searchsorted(series.t_ns, _started_ns(a)))
+    start_ns = _started_ns(a)
+    first = int(np.searchsorted(series.t_ns, start_ns))
+    first = max(first, int(np.searchsorted(series.t_ns, start_ns, "right")) - 1)  # both may be of one moment
     return first if first < len(series.t_ns) else 0
 
 

@@ -139,8 +139,16 @@ def _check_preset(
     origin: Mapping[tuple[str, str], str],
     path: Path | None,
 ) -> None:
-    """Refuse a file that takes away what the preset is for: its first key. One with every key does."""
+    """Refuse a file that takes away what the preset is for: its first key. One with every key does.
+
+    Of an autopilot without an INS of its own none may be stated, wherever that is.
+    """
     values = _preset(preset)
+    if values and "inertial.independent" not in values and tree.get("inertial", {}).get("independent"):
+        raise ConfigError(
+            f"--preset {preset} is for an autopilot without an INS of its own, and "
+            f"{origin['inertial', 'independent']} sets inertial.independent = true: leave out one of them"
+        )
     other = []
     for name, value in values.items():
         section, _, key = name.partition(".")
@@ -284,7 +292,9 @@ def _wanted(kind: Any, value: Any) -> str:
         return ""
     base, limit = get_args(kind)
     number = "a whole number" if base is int else "a number"
-    without = ", without quotes" if isinstance(value, str) else ""
+    without = ""
+    if isinstance(value, str):
+        without = ", with a decimal point" if "," in value else ", without quotes"
     if base is int and isinstance(value, float) and value.is_integer():
         without = ", without point or exponent"
     return f"give {number} {_interval(limit)}{without}"

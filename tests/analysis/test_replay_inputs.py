@@ -19,6 +19,7 @@ from companion.storage.run_metadata import logged_configuration
 TESTS = pathlib.Path(__file__).parents[1]
 SHARED = TESTS.parent.parent / "shared" / "data"
 FLIGHT = TESTS / "data" / "umn_fixed_wing_cut"
+NO_CHANNEL = "no estimate: The log has nothing for an inertial channel."
 
 
 def run(*arguments: object, fails: type[Exception] | None = None) -> Result:
@@ -101,12 +102,20 @@ def test_converted_log_replays_as_the_original(tmp_path: pathlib.Path) -> None:
     converted = tmp_path / "flight.mcap"
     assert "879 records" in run("log", "convert", FLIGHT, "-o", converted).output
     once, twice = tmp_path / "once.mcap", tmp_path / "twice.mcap"
-    first, second = report(FLIGHT, "-o", once), report(converted, "-o", twice)
+    by_local = ("--with", "inertial.source=local_position")
+    first, second = report(FLIGHT, *by_local, "-o", once), report(converted, *by_local, "-o", twice)
     assert first["inputs"] == second["inputs"] > 800
     assert first["outputs"] == second["outputs"] and first["outputs"]["Solution"] > 200
     assert values(once, r.Solution) == values(twice, r.Solution)
     again = report(twice)  # the output is an own log and replays bit for bit
     assert again["compared"] > 0 and again["different"] == 0
+
+
+def test_a_log_without_an_inertial_channel_is_explained(tmp_path: pathlib.Path) -> None:
+    note = report(FLIGHT, "-o", tmp_path / "x.mcap")["notes"][0]
+    assert note.startswith(
+        "no estimate: The log has nothing for an inertial channel. Give --with inertial.source="
+    )
 
 
 def test_gnss_delay_is_reported(tmp_path: pathlib.Path) -> None:
@@ -119,12 +128,13 @@ def test_navigator_predicts_in_an_outage_and_uses_simulated_beacons(
     tmp_path: pathlib.Path, beacons: pathlib.Path
 ) -> None:
     without_gnss, aided = tmp_path / "without_gnss.mcap", tmp_path / "aided.mcap"
-    result = report(FLIGHT, "-o", without_gnss, "--outage", "GNSS:30-60")
+    by_local = ("--with", "inertial.source=local_position", "--outage", "GNSS:30-60")
+    result = report(FLIGHT, "-o", without_gnss, *by_local)
     start = min(values(without_gnss, r.LocalPosition), key=lambda x: x.rx_ns).rx_ns
     assert max(fix.rx_ns for fix in values(without_gnss, r.Gnss)) < start + 31 * 10**9
     assert {s.mode for s in values(without_gnss, r.Solution)[-20:]} <= {r.Mode.PREDICTING, r.Mode.UNTRUSTED}
     assert any("autopilot's own GNSS" in note for note in result["notes"])
-    result = report(FLIGHT, "-o", aided, "--outage", "GNSS:30-60", "--rsbn", beacons)
+    result = report(FLIGHT, "-o", aided, *by_local, "--rsbn", beacons)
     assert any(
         "of 2 beacons (11, 12) simulated along the log's own smoothed track" in n for n in result["notes"]
     )
@@ -173,7 +183,7 @@ def test_outage_counts_from_the_first_record_as_the_report_does(tmp_path: pathli
     assert type(first) is r.Event
     seconds = [round((fix.rx_ns - first.rx_ns) * 1e-9) for fix in values(output, r.Gnss)]
     assert seconds == [30, 31, 32, 33, 34, 38, 39, 40]
-    assert result["notes"] == ["--outage GNSS:41-50 has no effect: the log ends at 40 s"]
+    assert result["notes"] == ["--outage GNSS:41-50 has no effect: the log ends at 40 s", NO_CHANNEL]
     (flight,) = result["flights"]
     assert (flight["start_s"], flight["end_s"]) == (pytest.approx(30.0), pytest.approx(40.0))
 
@@ -181,7 +191,8 @@ def test_outage_counts_from_the_first_record_as_the_report_does(tmp_path: pathli
 def test_beacon_out_of_reach_is_described_in_a_note(tmp_path: pathlib.Path) -> None:
     (exchanged := tmp_path / "exchanged.csv").write_text("id,lat_deg,lon_deg,alt_m\n5,7.0,45.0,300\n")
     result = report(dataflash_with_text_first(tmp_path), "-o", tmp_path / "x.mcap", "--rsbn", exchanged)
-    (note,) = result["notes"]
+    (note, without_channel) = result["notes"]
+    assert without_channel == NO_CHANNEL
     assert note.startswith(f"no beacon of {exchanged} is received along the log's own smoothed track")
     assert ": the nearest, 5 at 7, 45 deg and 300 m, is 5" in note
 
@@ -308,11 +319,11 @@ def test_correctors_that_the_configuration_does_not_use_are_reported(tmp_path):
     log, output, table = dataflash_with_text_first(tmp_path), tmp_path / "x.mcap", tmp_path / "second.csv"
     table.write_text("t_s,ins,lat_deg,lon_deg\n32,0,45,7\n")
     use = "inertial.independent=true,inertial.correctors=second_ins"
-    unused = [f"records of second_ins have no effect: give --with {use}"]
+    unused = [f"records of second_ins have no effect: give --with {use}", NO_CHANNEL]
     assert report(log, "-o", output, "--correctors", table)["notes"] == unused
     other = use.replace("second_ins", "stars")
     assert report(log, "-o", output, "--correctors", table, "--with", other)["notes"] == unused
-    assert report(log, "-o", output, "--correctors", table, "--with", use)["notes"] == []
+    assert report(log, "-o", output, "--correctors", table, "--with", use)["notes"] == [NO_CHANNEL]
 
 
 def test_corrector_rows_outside_the_log_are_reported_and_not_used(tmp_path):
@@ -324,7 +335,8 @@ def test_corrector_rows_outside_the_log_are_reported_and_not_used(tmp_path):
     result = report(log, "-o", output, "--correctors", table, "--with", use)
     assert result["notes"] == [
         f"{table}: 3 of 6 rows are not used: t_s from -40.0 to 9001.0, and the log has 0 to 40.0 s; check "
-        "that the table is of this flight"
+        "that the table is of this flight",
+        NO_CHANNEL,
     ]
     first = next(iter(flight_log.read(output))).value.rx_ns
     assert [(row.rx_ns - first) * 1e-9 for row in values(output, r.SecondIns)] == [0.0, 32.5, 40.0]

@@ -146,6 +146,18 @@ def test_presets_of_a_stock_autopilot_never_take_its_position_for_an_ins() -> No
     assert recommend_preset("other") is None
 
 
+@pytest.mark.parametrize("preset", ["stock-autopilot", "px4"])
+def test_a_preset_for_an_autopilot_without_an_ins_rejects_one(preset: str, tmp_path: Path) -> None:
+    (file := tmp_path / "ins.toml").write_text("[inertial]\nindependent = true\n")
+    for path, pairs, where in (
+        (None, ["inertial.independent=true"], "--set inertial."),
+        (file, [], str(file)),
+    ):
+        with pytest.raises(ConfigError, match=r"without an INS of its own, and .*: leave out one") as caught:
+            load(path, preset=preset, environment={}, pairs=pairs)
+        assert where in str(caught.value)
+
+
 def test_presets_have_the_order_of_their_grades() -> None:
     grades = [
         load(preset=name, environment={}).inertial for name in ("navigation-ins", "tactical-ins", "mems")

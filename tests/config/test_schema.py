@@ -224,6 +224,15 @@ def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> N
         ),
         (["signing.always_accepted=[109,-1]"], "always_accepted has -1: give message ids from 0 to 16777215"),
         (["signing.always_accepted=16777216"], "always_accepted has 16777216: give message ids from 0 to"),
+        (["rates.imu_hz=2"], "rates.imu_hz = 2: an IMU slower than 4 Hz is not used; set 4 or more, or 0 to"),
+        (
+            ["output.profile=ardupilot", "output.odometry_hz=2"],
+            "output.odometry_hz = 2: ArduPilot does not arm with less than 4 Hz; set 4 or more, or -1",
+        ),
+        (
+            ["gnss.sigma_m=3,5"],
+            "gnss.sigma_m = '3,5' is invalid: give a number from 0.01 to 1000, with a decimal",
+        ),
         (['log.folder=""'], "log.folder = '' names no folder: give one, for example logs"),
         (['log.folder="a\\u0000"'], "log.folder = 'a\\x00' has a null character: remove it"),
         (['signing.stamp_file="\\u0000"'], "signing.stamp_file = '\\x00' has a null character"),
