@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load
+from companion.config import Config, ConfigError, InertialConfig, OutputConfig, load, parse
 from companion.link import dialect, frame
 from companion.link.fields import deg_e7
 from companion.nav.geometry import Geodetic, displace, local_to_geodetic, slant_range_azimuth
@@ -543,7 +543,7 @@ def test_gnss_of_px4_is_on_after_our_positions_were_switched_off(monkeypatch: py
 @pytest.mark.parametrize("hz", [0.8, 0.2])
 def test_source_set_follows_gnss_by_a_slow_output(hz: float) -> None:
     """A second between two positions was a gap: set 2 was never requested, and nothing reported."""
-    flight = Flight(configured("output.profile=ardupilot", f"output.odometry_hz={hz}"))
+    flight = Flight(parse(f"[output]\nprofile = 'ardupilot'\nodometry_hz = {hz}", "an old log"))
     flight.fly(20.0)
     flight.fly(20.0, gnss=False)
     assert flight.source_set == 2
