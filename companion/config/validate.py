@@ -16,7 +16,6 @@ from companion.config.schema import Config
 #: Lowest rate of a message that is sent or requested: its interval fits 31 bits of microseconds.
 MIN_RATE_HZ = 0.01
 MIN_ODOMETRY_HZ = 4.0  # ArduPilot's health check of VISO_TYPE = 1
-MIN_IMU_HZ = 4.0  # a slower one is not used
 #: Most bins of the predictor's window: a greater linear program delays the solutions.
 MAX_BINS = 600
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -134,14 +133,7 @@ def find_mistakes(config: Config) -> Iterator[tuple[str, str, str]]:
             "folder",
             f"log.folder = {config.log.folder!r} names no folder: give one, for example logs",
         )
-    hz, odometry_hz = config.rates.imu_hz, config.output.rates_hz[MESSAGES["odometry"]]
-    if 0.0 < hz < MIN_IMU_HZ:
-        yield (
-            "rates",
-            "imu_hz",
-            f"rates.imu_hz = {hz:g}: an IMU slower than {MIN_IMU_HZ:g} Hz is not used; set {MIN_IMU_HZ:g} or "
-            "more, or 0 to fly without it",
-        )
+    odometry_hz = config.output.rates_hz[MESSAGES["odometry"]]
     if config.output.profile == "ardupilot" and 0.0 < odometry_hz < MIN_ODOMETRY_HZ:
         yield (
             "output",

@@ -224,7 +224,6 @@ def test_no_prediction_ahead_and_the_ends_of_the_message_ids_are_accepted() -> N
         ),
         (["signing.always_accepted=[109,-1]"], "always_accepted has -1: give message ids from 0 to 16777215"),
         (["signing.always_accepted=16777216"], "always_accepted has 16777216: give message ids from 0 to"),
-        (["rates.imu_hz=2"], "rates.imu_hz = 2: an IMU slower than 4 Hz is not used; set 4 or more, or 0 to"),
         (
             ["output.profile=ardupilot", "output.odometry_hz=2"],
             "output.odometry_hz = 2: ArduPilot does not arm with less than 4 Hz; set 4 or more, or -1",
