@@ -144,7 +144,11 @@ def _check_preset(
     Of an autopilot without an INS of its own none may be stated, wherever that is.
     """
     values = _preset(preset)
-    if values and "inertial.independent" not in values and tree.get("inertial", {}).get("independent") is True:
+    if (
+        values
+        and "inertial.independent" not in values
+        and tree.get("inertial", {}).get("independent") is True
+    ):
         raise ConfigError(
             f"--preset {preset} is for an autopilot without an INS of its own, and "
             f"{origin['inertial', 'independent']} sets inertial.independent = true: leave out one of them"
